@@ -1,8 +1,8 @@
 """Simulation of sampling intervals by a sixth-order Runge–Kutta method, in 1, 2, 4, ... substeps of equal length.
 
-The system's own ``rate(x)``, or else an estimate of the error, sets the number of substeps. Single states on Python
-floats (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13 of the state in each
-step. Where equal substeps are not accurate enough, substeps whose length follows the error replace them.
+The number of substeps follows from the system's own ``rate(x)``, or else is 1; an estimate of the error may raise it.
+Single states on Python floats (:func:`advance`) and batches on arrays (:func:`advance_batch`) agree to rounding, 1e-13
+of the state in each step. Where equal substeps are not accurate enough, the error sets each substep's length.
 """
 
 import functools

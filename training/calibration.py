@@ -22,7 +22,7 @@ from training.trajectories.motions import filter_states
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # measurement noise, in multiples of the largest level in training
 # Times since reset, in units of the source's ``pace``.
 AGES = (0.0, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35, 0.6, 1.0, 2.0, 4.0, 8.0, 16.0)
-# Number of samples of a run around each age (four times this at the last); at a single age motions may be in phase.
+# Samples of a run around each age (at the last, four times as many). One would not do, as motions may be in phase.
 PER_AGE = 6
 FEWEST = 50  # least number of errors for a covariance or a quantile
 LEAST_VARIANCE = 1e-6  # added to the variance of each state's error, as a fraction of the state's squared range

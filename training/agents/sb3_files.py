@@ -77,9 +77,9 @@ def to_sb3(agent: Agent, *, trusted: str | None = None) -> BaseAlgorithm:
 def from_sb3(
     path: str | os.PathLike[str], task: Task, information: Information = "x_hat", observer: str | None = None
 ) -> Agent:
-    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task, without the wrapper VecNormalize.
+    """Read an agent that stable-baselines3 or rl-zoo3 has trained on a task without the wrapper VecNormalize.
 
-    Only the tensors and the text of the file are read (by torch with ``weights_only``), so none of its code runs.
+    Only the file's tensors (by torch with ``weights_only``) and its text are read, so none of its code runs.
     """
     if task.system is not None and information in OBSERVED and observer is None:
         observer = observer_of(get_system(task.system))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # error, in standard deviations of z, with which a network reads its input z even without noise
+RESOLUTION = 1e-3  # a network's error in reading its input z, even without noise, in standard deviations of z
 
 Verdict = Literal["ok", "note", "problem"]
 

@@ -23,12 +23,12 @@ LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inpu
 BEYOND = 2.0  # size, relative to X, of the box in which a third of the calibration runs start
 # Random inputs drive half of the calibration runs. A policy, if given, drives all, and explores in half of them.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # a tracker's least measurement noise, relative to the system's (if this is 0: to 5 % of y's range)
-LEAST_PROCESS_NOISE = 0.005  # least level for a tracker, in System.scale per System.pace; a tenth of the default
+LEAST_NOISE = 0.001  # a tracker's least measurement noise, as a share of the system's (or, if 0, of 5 % of y's range)
+LEAST_PROCESS_NOISE = 0.005  # a tracker's least process noise, in System.scale per System.pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval
 INTEGRATION_ERROR = 2e-5  # steps are halved until 99 % of the errors are below this, in standard deviations of x
-TOO_FAR_OFF = 0.01  # likewise: if SUBSTEPS steps err by more, as where f jumps, a Flow is learned in place of f
+TOO_FAR_OFF = 0.01  # in the same unit: if SUBSTEPS steps err by more, as where f jumps, a Flow is learned instead
 INCREMENTS, JUDGED = 200_000, 0.05  # number of increments for a Flow, and the share held out to measure its error
 DEVIATIONS = (1e-4, 0.3)  # least and largest rms distance of an increment's start from a motion, in standard deviations
 
@@ -108,7 +108,7 @@ class SimulatedSource:
         }
 
     def pairs(self, linear: LinearFilter, *, free: bool = False, report: Report = lambda done: None) -> Pairs:
-        """Return states of motions and of a filter along them; if ``free``, inputs act only before some starts."""
+        """Return states of motions and of a filter along them. If ``free``, inputs act at most before a start."""
         config, rng = self.config, generator(Stream.TRAINING, self.config.seed, *([1] if free else []))
         how: dict[str, Any] = {"kinds": DRIVEN if self.has_free_map else KINDS, "policy": self.policy}
         if free:
@@ -153,7 +153,7 @@ class SimulatedSource:
         return equations
 
     def increments(self, *, report: Report = lambda done: None) -> tuple[Increments, Increments]:
-        """Return changes of the state over one sampling interval, at states near motions."""
+        """Return changes of the state over one sampling interval, near motions: for training, and held out."""
         rng = generator(Stream.CALIBRATION, self.config.seed, 5)
         along, u = self._states(300)
         rows = rng.integers(len(along), size=INCREMENTS)

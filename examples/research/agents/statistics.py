@@ -8,7 +8,7 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scale scores to 0 for ``idle``, an idle agent's, and 1 for ``top``, the interquartile mean with full state."""
+    """Scale scores so that ``idle``, an idle agent's, is 0, and ``top``, full-state agents' interquartile mean, 1."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
@@ -23,7 +23,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
 
     With only five agents the interval covers the true value in about nine of ten cases.
 
-    Shapes: ``values`` (n,), ``best`` (m,), the scores of the agents on the full state.
+    Shapes: ``values`` (n,), the agents' scores; ``best`` (m,), the scores of agents on the full state.
     """
 
     def statistic(mine: np.ndarray, tops: np.ndarray = best, axis: int = -1) -> np.ndarray:
@@ -33,7 +33,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3 or np.isnan(score):
         return score, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    with warnings.catch_warnings():  # an interval is NaN if a resample of ``best`` does not exceed ``idle``
+    with warnings.catch_warnings():  # an interval is NaN if a resample of ``best`` has a mean <= ``idle``
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         resampled = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
     ends = resampled.confidence_interval
