@@ -1,6 +1,6 @@
 """Your own task, from plant to agent: a motor brings an unmeasured link to a goal angle through a spring.
 
-The same from the command line, as docs/guides/own_task.md explains::
+The commands for the observer and for the agent on its estimate (docs/guides/own_task.md has more)::
 
     kkl-gym train examples/own_task.py
     kkl-gym agent train examples/own_task.py --observer runs/flexible_joint/flexible_joint.safetensors
@@ -50,7 +50,7 @@ class FlexibleJoint(kkl_gym.System):
         return (x[0],)
 
     def reward(self, x, u):
-        """1 if the link rests at its goal, and less elsewhere."""
+        """1 if the link rests at its goal, and less otherwise."""
         return 1.0 / (1.0 + 20.0 * (x[2] - self.goal) ** 2 + 0.5 * x[3] ** 2)
 
     def terminated(self, x):

@@ -11,9 +11,9 @@ theta_dot (rad/s) and time (s). These are the twelve runs without motor input of
 Di Meglio, "Towards gain tuning for numerical KKL observers" (2023), repository
 Centre-automatique-et-systemes/learn_observe_KKL, MIT licence. docs/results/qube.md has the results.
 
-Two facts about the device are used besides the records. Left and right are symmetric, so the observer learns from each
-run twice: as recorded, and mirrored, with the signs of both angles changed. No angle of the arm is special, so the map
-sees changes of the arm's angle, not the angle itself.
+Two assumptions about the device are used besides the records. Left and right are symmetric, so the observer learns from
+each run twice: as recorded, and mirrored, with the signs of both angles changed. No angle of the arm is special, so the
+map sees changes of the arm's angle, not the angle itself.
 
 Eight runs contain few of the possible swings of a pendulum. Therefore a second observer also learns from motions
 that the device's equations simulate from random states, with parameters that were fitted to the same eight runs.
@@ -23,8 +23,8 @@ estimator is a Kalman filter with a model whose arm can stick. The second observ
 when their estimates disagree.
 
 The recorded velocities are not measurements. They follow exactly from the recorded angles, sample by sample, as
-v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative after a low-pass filter of 55.79 rad/s. Estimated angles pass
-through the same formula before their velocities are compared.
+v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative after a low-pass filter of 55.79 rad/s. The velocities of
+a Kalman filter are computed from its angles by the same formula before they are compared.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,8 +54,8 @@ from training.sources.recorded import RecordedSource, recorded_preset
 SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
 MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # factors of the hidden signals in the mirror image
 TRAINING, HELD_OUT = (1, 2, 4, 5, 7, 8, 10, 11), (3, 6, 9, 12)
-# Training runs with large and with small swings. --cross-validate holds out each half in turn to test extrapolation to
-# other swings, because the test runs swing less than any training run.
+# The training runs in two halves, with large and with small swings. --cross-validate holds out each half in turn to
+# test extrapolation to other swings, because the test runs swing less than any training run.
 FOLDS = ((1, 4, 7, 10), (2, 5, 8, 11))
 DT = 0.004  # s, the device's sampling interval
 TRANSIENT = 1.0  # s; errors before this time of each run do not count
@@ -122,9 +122,9 @@ def main(
     path
         Folder with run01.csv to run12.csv.
     out
-        Folder of the trainings, which resume from checkpoints; receives qube.safetensors, table.md and estimates.png.
+        Folder of the trainings, which resume from checkpoints; also for qube.safetensors, table.md and estimates.png.
     cross_validate
-        Evaluate the settings on the training runs instead: hold out each half of them once; the test runs are not read.
+        Test the settings on the training runs only, each half held out once, and print the errors; save no results.
     inverse_steps
         Training batches of each network.
 
@@ -217,7 +217,7 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
 
 
 def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:
-    """Return estimates along each training run, by observers and equations learned from the other half of runs."""
+    """Return estimates along each training run, by observers and equations learned from the other half of the runs."""
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]

@@ -78,7 +78,7 @@ class BothAngles(Qube):
 
 @dataclass(frozen=True)
 class Sticking(BothAngles):
-    """The model BothAngles, but the friction changes its sign so abruptly that the arm sticks until it is pushed."""
+    """The model BothAngles, but the friction changes its sign so abruptly that small torques hardly move the arm."""
 
     arm_slip: float = 0.004
     pendulum_slip: float = 0.2
@@ -92,7 +92,7 @@ class Sticking(BothAngles):
 
 @dataclass(frozen=True)
 class Pushed(Sticking):
-    """The model Sticking with y = theta and with an unknown torque on the arm, which stands for errors of the friction.
+    """The model Sticking with y = theta and an unknown torque on the arm that stands for errors of the friction model.
 
     The torque, an Ornstein-Uhlenbeck process, is a fifth state, in units of 0.1 mN m.
     """

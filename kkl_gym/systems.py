@@ -101,7 +101,7 @@ class Rossler(System):
     Parameters
     ----------
     a : float
-        Growth of x2.
+        Growth rate of x2.
     b : float
         Constant part of x3'.
     c : float
@@ -200,7 +200,7 @@ SYSTEMS: dict[str, type[System]] = {cls.name: cls for cls in (ReverseDuffing, Va
 
 
 def get_system(system: "str | System | type[System]", parameters: Mapping[str, float] | None = None) -> System:
-    """Return the system that ``system`` names, with ``parameters`` changed from their defaults.
+    """Return a system, given by name, class or instance, with the given ``parameters`` changed.
 
     Parameters
     ----------

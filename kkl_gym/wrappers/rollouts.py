@@ -75,9 +75,9 @@ class NamedEstimator(KKLEstimator):
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the observations in a report: y, with its last value where it is missing, then x_hat or z."""
+        """Return the observations in a report: y, held where missing, then x_hat and any standard deviations, or z."""
         y = report["y"]
-        # Where all rows of a report have just restarted, y holds no NaN, because first samples are complete.
+        # A report of some rows has fewer rows than _held, but its y holds no NaN: it is of complete first samples.
         if np.isnan(y).any():
             y = np.where(np.isnan(y), self._held, y)
         return np.concatenate([y, super().shown(report)], axis=-1)
@@ -102,7 +102,7 @@ class Samples:
         self.count = 0
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Return outputs and hidden signals after a reset; hidden signals that the environment does not show are NaN.
+        """Return outputs and hidden signals after a reset; the hidden ones are NaN unless the environment shows all.
 
         Sets ``sample`` and, if shown, ``x`` in ``info``, as in a KKLEnv.
         """
@@ -121,7 +121,7 @@ class Samples:
         return y, u
 
     def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
-        """Return the true hidden signals as ``{"x": ...}``; empty if the environment does not show them."""
+        """Return the true hidden signals as ``{"x": ...}``; empty unless the environment shows them all."""
         if self.hidden is None:
             return {}
         try:
@@ -132,7 +132,7 @@ class Samples:
 
 
 def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) -> Reader | None:
-    """Return the reader of the hidden signals, or None if the environment does not show them."""
+    """Return the reader of the hidden signals, or None if the environment does not show them all."""
     try:
         return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
     except ValueError:
@@ -140,14 +140,14 @@ def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) 
 
 
 def _check_actions(env: Any, space: gym.Space[Any]) -> None:
-    """Raise ValueError if a wrapper inside changes the scale of actions, as ClipAction does with its infinite box."""
+    """Raise ValueError if a wrapper inside changes how inputs are scaled, as ClipAction does by its infinite box."""
     base, source = env.unwrapped, source_of(env)
     own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
     here, there = (Inputs(one, source=source) for one in (space, own))
     if not (np.array_equal(here.low, there.low) and np.array_equal(here.high, there.high)):
         raise ValueError(
-            f"actions of {source} are of {own}, and a wrapper inside takes {space}: the observer would misread them; "
-            "put that wrapper outside"
+            f"{source} takes actions in {own}, but a wrapper between it and the observer takes {space}: the observer "
+            "would misread them; put that wrapper outside the observer's"
         )
 
 

@@ -180,7 +180,7 @@ def test_the_observer_is_replaced_at_once(saved, tmp_path):
 def test_wrappers_that_change_the_meaning_of_actions(saved):
     path = saved(PENDULUM())
     for wrap in (ClipAction, partial(DiscretizeAction, bins=3)):
-        with pytest.raises(ArtifactError, match=r"a wrapper inside takes .*: the observer would misread them; put"):
+        with pytest.raises(ArtifactError, match=r"a wrapper between .* takes .*: the observer would misread them"):
             KKLObservation(wrap(gym.make("Pendulum-v1")), path)
     half = np.float32([0.5])
     plain, inside = (KKLObservation(gym.make("Pendulum-v1"), path) for _ in range(2))
