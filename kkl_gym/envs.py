@@ -42,7 +42,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     and returns the sample y_k+1.
 
     **Action.** ``Box(-1, 1, (nu,))``, multiplied by the system's input bounds; values outside are clipped. Under action
-    0 the system is autonomous.
+    0 the motion is free.
 
     **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``). x is
     within the system's declared bounds. y is clipped to the range of noise-free outputs within these bounds, widened by
@@ -283,7 +283,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
         return actions
 
     def __getstate__(self) -> dict[str, Any]:
-        # Windows and compiled steps cannot be copied; they are made again at their next use, or at a reset.
+        # Windows and compiled steps cannot be copied. A copy opens a window at its next frame, and compiles at a reset.
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _exchanged(self) -> None:

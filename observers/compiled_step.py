@@ -12,7 +12,7 @@ from observers.tracker import Tracker
 
 _LANES = 8  # rows of the batch that the kernel steps together
 MOST_OPERATIONS = 400  # in an expression; longer expressions, such as a network for f, take many seconds to compile
-MOST_ROWS = 32  # of a covariance; larger ones, for _LANES observers at once, would exceed a thread's stack
+MOST_ROWS = 32  # of a covariance matrix; larger ones, for _LANES observers at once, would exceed a thread's stack
 
 
 class CompiledStep:
@@ -84,14 +84,14 @@ class CompiledStep:
 
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
-    """Return ages in seconds since reset, and the covariances of both maps at these ages, (maps, ages, nx^2)."""
-    errors = [each.error for each in maps if each.error is not None]  # each map has a covariance if the observer tracks
+    """Return ages in seconds since reset, and the covariances of both decoders at these ages, (2, ages, nx^2)."""
+    errors = [each.error for each in maps if each.error is not None]  # both have one if the observer tracks
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 
 
 def _of_filter(linear: LinearFilter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the transition matrix's diagonal above ``drive``, and places and values of the matrix's other entries."""
+    """Return the transition matrix's diagonal, stacked on ``drive``; places and values of its other nonzero entries."""
     diagonal = linear.transition.diagonal()
     places = np.array(np.nonzero(linear.transition - np.diag(diagonal)))
     return np.vstack([diagonal, linear.drive]), places, linear.transition[*places]

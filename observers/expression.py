@@ -157,7 +157,7 @@ def _source(part: Any) -> str:
 
 
 def _joined(source: str, sources: list[str], arity: int) -> str:
-    """Return source that applies a function of ``arity`` arguments to more arguments; halving keeps the nesting low."""
+    """Return source that applies a function of ``arity`` arguments to all ``sources``; halving limits the nesting."""
     if len(sources) > _MOST_NESTED:
         half = len(sources) // 2
         sources = [_joined(source, sources[:half], arity), _joined(source, sources[half:], arity)]

@@ -211,7 +211,7 @@ def steps(nx: int, ny: int, nu: int, W: int) -> Any:
 
     @_inlined
     def reject(now: Any, y: Any, expected: Any, S: Any, r: Any, gate: float, window: float) -> None:
-        """Set outputs beyond the gate to NaN; a start, a divergence or a window of rejections opens the gate."""
+        """Set outputs beyond the gate to NaN; a start, a divergence or ``window`` rejections in a row open the gate."""
         for k in range(ny):
             innovation, count = y[k] - expected[k], now[rejections + k]
             far = choose(innovation * innovation, gate * gate * (S[k * ny + k] + r[k]), 1.0, 0.0)

@@ -23,7 +23,7 @@ def write_report(path: Path, result: Result, source: Source | System) -> None:
     names = source.model.state_names if isinstance(source, SimulatedSource) else (artifact.signals or {})["hidden"]
     try:
         runs = source.runs(report=lambda done: None)
-        # Recorded runs differ in length, and NaN fills up the shorter ones. Only the longest are drawn, perhaps one.
+        # Recorded runs differ in length, and NaN fills up the shorter ones. Of the longest, one or two are drawn.
         length = np.isfinite(runs.x).all(-1).sum(0)
         by_noise = sorted(np.flatnonzero(length == length.max()).tolist(), key=lambda run: runs.process_noise[run])
         chosen = by_noise[:: max(1, len(by_noise) - 1)]  # the first and the last

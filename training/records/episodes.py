@@ -167,7 +167,7 @@ def dataset_folder(name: str) -> Path:
         raise ValueError(f"a Minari data set needs a name such as pendulum/random-v0, got {name!r}") from None
     folder = _folder(name)
     if folder.exists():
-        raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")
+        raise ValueError(f"there is a data set {name} already; name another (--dataset), or run `minari delete {name}`")
     require_writable(folder)
     return folder
 

@@ -13,10 +13,10 @@ from observers import LinearFilter
 from observers.checks import real_array
 
 ROLES = {"y": "measured", "u": "inputs", "x": "hidden"}  # field of Record: field of Signals that names its columns
-MAX_SAMPLE = 1e100  # largest valid sample, so that sums of squares stay finite
+MAX_SAMPLE = 1e100  # largest absolute value of a valid sample, so that sums of squares stay finite
 LONGEST_GAP = 3.0  # longest gap, in steps of the grid, in which samples are interpolated
 ROUNDING = 1e-6  # tolerance of times, in steps of the grid
-MOST_STEPS = 1000  # largest number of grid steps for each sample; a record with more has a jump in its times
+MOST_STEPS = 1000  # largest mean number of grid steps between samples; a record with more has a jump in its times
 
 
 @dataclass(frozen=True)

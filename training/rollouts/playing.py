@@ -221,6 +221,6 @@ def _numbers(values: list[Any], key: str) -> np.ndarray:
 
 
 def _stacked(space: gym.Space[Any], values: Sequence[Any]) -> Any:
-    """Stack values of a space into arrays; those of a Dict or Tuple keep its structure."""
+    """Stack values of a space into arrays; a Dict or Tuple keeps its structure."""
     empty: Any = create_empty_array(space, len(values), fn=np.zeros)
     return concatenate(space, values, empty)
