@@ -18,7 +18,7 @@ ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
 def render_metadata(dt: float, modes: Collection[str], render_mode: str | None = None) -> dict[str, Any]:
-    """Return the modes and a frame rate of 1 / dt, at most FRAMES; ValueError if ``render_mode`` is not a mode."""
+    """Return the modes and the frame rate, 1 / dt rounded, from 1 to FRAMES; ValueError for an unknown mode."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
     return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}

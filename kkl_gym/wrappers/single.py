@@ -1,4 +1,4 @@
-"""Wrappers: a learned observer inside an environment, and actions that are held over several steps."""
+"""Wrappers: a learned observer around an environment, and actions that are held over several steps."""
 
 import os
 from collections import deque
@@ -39,7 +39,7 @@ class _SystemSamples:
         return info["y"], info["x"]
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return output after a step, and the input that led to it; ValueError if a sample was skipped or changed."""
+        """Return a step's output, and the input that led to it; ValueError if a wrapper skips or changes samples."""
         sample = int(info["sample"])
         if sample != self.count + 1:
             raise ValueError(
@@ -62,13 +62,13 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     the estimates are in ``parameters_hat``.
 
     With ``estimate="z"`` there is neither ``x_hat`` nor ``parameters_hat``, and :meth:`render` shows no estimate.
-    Neither the inverse map nor the tracker runs then, unless there is a monitor or the start is known.
+    Neither T_inv nor the tracker runs then, unless ``monitor`` or ``known_start`` is set.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). Such an observer sees the actions, and the measured signals that its file names. The
-    observation is then [y, x_hat] or [y, z]: the measured outputs, then the estimates. ``info`` also gains ``y``, the
-    inputs ``u`` that led to it, and ``sample``, the count of steps since reset. It gains ``x``, shape (nx,), the true
-    hidden signals, where the environment inside shows them. ``x`` is privileged: it serves evaluation and
+    observation is then [y, x_hat] or [y, z]: the measured outputs come first. ``info`` also gains ``y``, the inputs
+    ``u`` that led to it, and ``sample``, the count of steps since reset. It gains ``x``, shape (nx,), the true hidden
+    signals, where the environment inside shows them. ``x`` is privileged: it serves evaluation and
     ``training.KKLTrainingCallback``.
 
     Parameters
@@ -80,8 +80,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
     estimate : {"x", "z"}
-        The observation: "x" is the state estimate, clipped to the system's declared bounds, "z" the filter's state
-        [z_y, z_u].
+        The observation: "x" is the state estimate, clipped to the states' bounds. "z" is the filter's state
+        [z_y, z_u]; y drives the first part, u the second.
     measurement_noise : float or sequence of float, length ny, optional
         The noise level that the observer assumes, one for all outputs or one for each. None takes the level of the
         :class:`KKLEnv`, or 0 for an observer from rollouts. Maps that need a process-noise level always take that
@@ -182,7 +182,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # estimates
-        # Whether it renders is stored, because each access to render_mode passes through every wrapper.
+        # This is stored, because each access to render_mode passes through every wrapper.
         self._rendering = env.render_mode is not None
         # Observers around the environment are numbered from inside; the outermost, which has the last number, draws.
         self._draws = 0
@@ -195,7 +195,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and start the observer at its first sample. Returns the first estimate."""
+        """Reset the environment, and start the observer at the first sample. Returns the observation and ``info``."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._trail.clear()
         self._estimator.reset(*self._samples.first(obs, info))
@@ -209,7 +209,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         return self._show(info), float(reward), terminated, truncated, info
 
     def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """From now on, use the maps of another observer that has the same filter. The filter's state stays.
+        """From now on, use another map, which must have the same filter. The filter's state stays.
 
         The specification ``env.spec`` still names the observer with which the wrapper was made. In vectors of
         stable-baselines3, call ``env_method("replace_observer", artifact)``.
@@ -222,9 +222,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Raises
         ------
         ValueError
-            If the noise level is beyond the new maps' range, or the monitor in use needs limits that the maps lack.
+            If the noise level is beyond the new map's range, or the monitor in use needs limits that the new map lacks.
         observers.ArtifactError
-            If the artifact differs in more than its maps, as in A, B, dt or signals, or the file is missing or damaged.
+            If the new map differs in its system, A, B, dt or signals, or the file is missing or damaged.
         """
         self._estimator.replace(observer)
 

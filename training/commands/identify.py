@@ -41,7 +41,7 @@ class Identify:
 
     The folder (runs/NAME-identified, or runs/NAME-adapted with --observer) receives parameters.json, identification.png
     (residuals, and predictions of held-out records), NAME.safetensors, report.png, checkpoints and log.txt. Parameters
-    that the outputs do not identify are listed, and are null in parameters.json.
+    that the outputs do not identify are null in parameters.json; log.txt names them.
     """
 
     system: SystemName

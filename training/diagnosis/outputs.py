@@ -14,13 +14,13 @@ from training.presets import eigenvalues
 from training.sources.simulated import unknown_start
 from training.trajectories.motions import how_to_stay
 
-FOLLOWED, MAX_STEPS = 20, 2000  # number of motions, and largest number of steps of each
+FOLLOWED, MAX_STEPS = 20, 2000  # largest numbers of motions, and of steps of each
 MIN_STEPS = 10  # least number of samples of a motion
 # "problem" or "note" if more than this share of the initial standard deviation along a direction of x remains.
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names a state if its component of the direction, a unit vector, is larger
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
-# A symmetry: a state's least error is <= LOCALLY, but its error from similar y >= GLOBALLY, in standard deviations.
+# A symmetry: a state's least error is <= LOCALLY, but >= GLOBALLY if similar y predict it (in standard deviations).
 LOCALLY, GLOBALLY = 0.1, 0.3
 WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 
@@ -58,7 +58,7 @@ def least_errors(subject: Subject) -> tuple[np.ndarray, np.ndarray]:
     """Return posterior Cramér-Rao bounds along motions without process noise, and the covariance at their end.
 
     The bounds (levels, steps, nx) are in standard deviations of the states along motions; the first level is without
-    noise. The covariance (nx, nx), without noise, is relative to the variances of the start.
+    noise. The covariance (nx, nx), without noise, is normalised by the starts' standard deviations.
     """
     system, levels = subject.system, (0.0, *subject.noise)
     x, u = subject.followed[0][: MAX_STEPS + 1, :FOLLOWED], subject.followed[1][:MAX_STEPS, :FOLLOWED]
@@ -116,6 +116,6 @@ def _symmetries(subject: Subject, exact: np.ndarray) -> dict[tuple[int, ...], Fi
         errors = np.fmin(errors, left_by(z[::2], end[::2], z[1::2], end[1::2]))
     confused = np.flatnonzero((exact <= LOCALLY) & (errors >= GLOBALLY)).tolist()
     names = ", ".join(system.state_names[i] for i in confused)
-    text = f"{names}: y determines them near each state, but distant states have nearly the same y, as under a symmetry"
+    text = f"y determines {names} only locally: distant states have nearly the same y, as under a symmetry"
     advice = "let h measure what the symmetry changes, or estimate only what it leaves unchanged"
     return {tuple(confused): Finding("observability", "problem", text, advice)} if confused else {}

@@ -19,7 +19,7 @@ from training.trajectories.motions import DRIVEN, Controller, how_to_stay, rando
 COMPARED = 100  # number of points of X, and of 2X, at which the equations are evaluated
 POINTS = 1000  # number of points of X at which outputs are evaluated
 MOTIONS = 100  # number of motions; if the system has inputs and no policy is given, half are driven
-MANY = 0.5  # a larger share of motions that leave the bounds is a problem
+MANY = 0.5  # it is a problem if a larger share of the free, or of the driven, motions leaves the bounds
 # Change of y per sample, in standard deviations of y: a problem above COARSE, a note above JERKY; SMOOTH is advised.
 COARSE, JERKY, SMOOTH = 1.0, 0.5, 0.1
 STILL = 1e-9  # an output does not move if its range is at most this share of its largest absolute value
@@ -43,8 +43,8 @@ def of_X(system: System, n: int, factor: float = 1.0) -> np.ndarray:
 class Subject:
     """A system, its sampling, and motions for several checks, with the same random numbers each time.
 
-    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs, equally many of each of the ``kinds``, such as free.
-    States are NaN after they leave the bounds. ``stay`` (MOTIONS,) marks motions within bounds, ``y`` their outputs.
+    ``motions`` are states (steps + 1, MOTIONS, nx) and inputs. Each of the ``kinds``, such as free, has equally many
+    motions. States are NaN after they leave the bounds. ``stay`` (MOTIONS,) marks the motions that stay within them.
     """
 
     def __init__(

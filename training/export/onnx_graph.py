@@ -52,7 +52,7 @@ def onnx_model(exported: Exported) -> Any:
     assert program is not None
     model = program.model_proto
     for node in model.graph.node:
-        del node.metadata_props[:]  # lines of Torch's source, which would make up most of the file
+        del node.metadata_props[:]  # Torch's notes on each node's origin, which would make up most of the file
     model.graph.name = exported.name
     model.graph.doc_string = f"One step of the KKL observer {exported.source}. A state row of zeros marks a start."
     model.producer_name, model.producer_version = "kkl-gym", kkl_gym.__version__

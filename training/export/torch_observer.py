@@ -178,7 +178,7 @@ class TorchObserver(Module):
         return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
     def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Call ``method`` of the free map in rows without input since their start, and of the driven map elsewhere."""
+        """Call ``method`` of ``free``, T_inv for free motions, in rows without input so far, else of ``driven``."""
         driven = method(self.driven, z, *arguments)
         if self.free is None:
             return driven

@@ -233,8 +233,8 @@ class ThroughThird(Lorenz):
 def test_a_symmetry_is_no_poor_observability():
     found = findings(ThroughThird(), "observability", duration=6.0)
     assert [one.verdict for one in found] == ["problem", "ok"]
-    assert found[0].found.startswith("x1, x2: y determines them near each state, but distant states")
-    assert not any("near each state" in one.found for one in findings(Lorenz(), "observability", duration=6.0))
+    assert found[0].found.startswith("y determines x1, x2 only locally: distant states")
+    assert not any("only locally" in one.found for one in findings(Lorenz(), "observability", duration=6.0))
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_states_that_only_an_input_makes_observable(changes):
     assert {one.verdict for one in findings(made(**changes), "observability", duration=10.0)} == {"ok"}
     if "h" in changes:
         found = one(made(**NO_INPUT | changes), "observability", duration=10.0).found
-        assert found.startswith("x1, x2: y determines them near each state")
+        assert found.startswith("y determines x1, x2 only locally")
 
 
 def test_noise_that_hides_a_state():
