@@ -16,7 +16,7 @@ Class = TypeVar("Class")
 
 
 def load_class(name: str, base: type[Class]) -> type[Class]:
-    """Load a subclass of ``base``; a script that defines only one needs no class name."""
+    """Load a subclass of ``base``; ``name`` may lack the class if the module or script defines only one."""
     where, _, class_name = name.rpartition(":") if ":" in name else (name, "", "")
     failure = f"cannot load the {base.__name__.lower()} {name!r}"
     module = _imported(where, failure)

@@ -100,7 +100,7 @@ class Program:
     exact: bool
 
     def lines(self, name: str, zeros: int = 0) -> list[str]:
-        """Return Python code of the function, from a tuple of arguments to the results, followed by ``zeros`` zeros."""
+        """Return Python code of the function, from a tuple of arguments to a tuple of results and ``zeros`` zeros."""
         return [
             f"def {name}(values):",
             f"    {in_tuple(self.arguments)} = values",
@@ -115,7 +115,7 @@ def in_tuple(values: Iterable[str]) -> str:
 
 
 def program(function: Callable[..., Any], *letters: tuple[str, int]) -> Program:
-    """Record a function by a call on groups of symbols; each group has a letter and a number of components."""
+    """Record a call of a function with lists of symbols; ``letters`` holds a letter and a length for each list."""
     tape = Tape()
     groups = [[Symbol(tape, f"{letter}{i}") for i in range(n)] for letter, n in letters]
     results = tuple(map(text, function(*groups)))

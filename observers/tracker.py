@@ -12,8 +12,8 @@ from observers.motion import Motion
 from observers.unscented import add, factor, shift, solved, transformed, whitened
 
 # The two limits of Supervision follow from these quantiles of the normal distribution. Beyond the limit of the NIS, the
-# tracker discards its estimate; beyond that of the trend (the innovations' running mean), it inflates P. The trend's
-# mean square is more skewed than chi-square: white innovations exceed its limit with probability 2e-4, not 1e-5.
+# tracker discards its estimate; beyond that of the mean square of the trend (the innovations' running mean), it raises
+# P. This mean square is more skewed than chi-square: for white innovations its tail probability is 2e-4, not 1e-5.
 _DIVERGED = 6.0  # for the NIS, with tail probability 1e-9
 _COLOURED = 4.265  # for the mean square of the trend, with tail probability 1e-5
 _TREND = 0.25  # time constant of the trend, in multiples of Motion.window
@@ -25,7 +25,7 @@ KNOWN = 1e-3  # assumed standard deviation of a known initial state, in multiple
 
 @dataclass(frozen=True)
 class Supervision:
-    """Limits of the innovations' running statistics, valid at any noise level, and a new sample's share in each."""
+    """Limits of the innovations' running statistics, valid at any noise level; a sample's share in each statistic."""
 
     window: int
     share: float
@@ -68,9 +68,9 @@ class Tracker:
     :attr:`Motion.window` each step is repeated twice: the sample also corrects the state before the step, and the
     motion is linearised about this smoothed state (Kullberg et al., 2023). A known initial state skips this window.
 
-    The filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the filter's in
-    two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
-    filter has diverged if the mean square of its innovations over the window (NIS) exceeds its limit, or if its
+    A Kalman filter converges only locally; T_inv finds the state from anywhere. T_inv's estimate replaces the tracker's
+    in two cases: in the first window, if T_inv's covariance has the smaller determinant; and after a divergence. The
+    tracker has diverged if the mean square of its innovations over the window (NIS) exceeds a limit, or if its
     covariance is no longer positive definite. T_inv's covariance is taken at an age of at most one window, because the
     cause of the divergence may have disturbed z, too.
 

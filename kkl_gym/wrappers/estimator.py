@@ -32,7 +32,7 @@ class Estimates:
         self._running.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """Return the entries to add to ``info``, (m, ...), of all n environments or where ``rows`` (n,) is True."""
+        """Return the entries (m, ...) to add to ``info``, of all environments or the m where ``rows`` (n,) is True."""
         return {"x_hat": self._running.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -111,7 +111,7 @@ class KKLEstimator:
         )
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Use the maps of another observer with the same filter; the filter's state stays."""
+        """Use another map, which must have the same filter; the filter's state stays."""
         self.observer.replace(self.asked(observer))
 
     def asked(self, observer: str | os.PathLike[str] | Artifact) -> Artifact:

@@ -35,7 +35,7 @@ def check(
     policy: Controller | None = None,
     measurement_noise: Sequence[Level] | None = None,
 ) -> Iterator[Finding]:
-    """Yield the findings of all checks: whether the system works in environments, training and evaluation."""
+    """Yield the findings of the checks: whether the system works in environments, training and evaluation."""
     equations = [finding for name in list(CHECKS)[:2] for finding in _findings(name, Subject(of, np.nan, np.nan))]
     yield from equations
     if any(finding.verdict == "problem" for finding in equations):

@@ -14,7 +14,7 @@ from training.export.exported import tracker_arrays, tracker_numbers
 from training.export.torch_parts import Module, Network, TorchExpression, between, eliminated, product
 
 Tracked = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Scaled states (nx, n), covariance (nx, nx, n), NIS, mean square of the trend, number of samples (n,), trend (ny, n).
+"""Scaled states (nx, n), P (nx, nx, n), NIS (n,), mean square of the trend (n,), number of samples (n,), trend (ny, n).
 
 The trend is the running mean of the whitened innovations.
 """
@@ -122,7 +122,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """In the rows ``new``, predict again: linearise the motion about the last state, smoothed by the new sample."""
+        """In the rows ``new``, predict again: linearise motion about the previous state, smoothed by the new sample."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))

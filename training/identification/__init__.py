@@ -1,4 +1,4 @@
-"""Identification of a plant from records of its outputs by multiple shooting, and training of its observer.
+"""Identification of a plant by multiple shooting from records of its outputs, and training of its observer.
 
 :mod:`motions` simulates windows of the records, :mod:`shooting` fits parameters on windows of one length, and
 :mod:`windows` lengthens the windows. :mod:`identifiability` finds parameters, and signs of states, that the outputs do

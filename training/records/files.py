@@ -34,7 +34,7 @@ def read_records(
     """Read a record from each file, or from each episode of a data set, and check the records."""
     paths = [Path(path) for path in files]
     if not paths:
-        raise ValueError(f"name a file of recorded data, {', '.join(READERS)}, or a data set, minari:ID (--data)")
+        raise ValueError(f"name a file of recorded data ({', '.join(READERS)}) or a data set (minari:ID), by --data")
     if twice := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
     warn = warn or (lambda text: warnings.warn(text, stacklevel=4))

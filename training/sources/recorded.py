@@ -21,7 +21,7 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with this many records or more, whole records are held out; with fewer, the end of each
-STRETCHES, SAMPLES = 600, 2_000_000  # calibration: limits of stretches, and of samples (if more than 100 stretches)
+STRETCHES, SAMPLES = 600, 2_000_000  # calibration: most stretches, and most samples (100 stretches may have more)
 STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
 FEWEST = 50  # calibration needs at least this many samples at which a stretch may begin
 BEYOND = 0.5  # a tracker's estimates may leave the range of each recorded state by this fraction of the range
@@ -31,7 +31,7 @@ UNEXPLAINED = 0.7  # a larger residual of y = C x, in standard deviations of the
 ROUNDING, OUTLIER = 1e-6, 6.0  # rounding, as a share of an output; least outlier, in the residual's standard deviations
 LEAST_NOISE = 1e-4  # least noise that a tracker assumes, in standard deviations of the outputs, as R must not be 0
 MODES, SLOWEST, FASTEST = 12, 0.15, 10.0  # for records: modes of each output; their rates in multiples of signal_rate
-RECORD_MEMORIES = 3.0  # least median length of records in settling times, unless all modes would exceed signal_rate
+RECORD_MEMORIES = 3.0  # least number of settling times in a median record; fewer if all modes would exceed signal_rate
 # For rollouts, whose hidden signals an agent needs within a few steps: number of modes of each output, and their rates
 # per step. A few modes that lie far apart forget the start soon, and distinguish single steps.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
