@@ -5,7 +5,7 @@ Training and evaluation from the command line::
     kkl-gym train examples/cart_pole.py:CartPole --policy controller
     kkl-gym evaluate runs/cart_pole/cart_pole.safetensors --system examples/cart_pole.py:CartPole
 
-docs/guides/your_system.md explains such plants.
+docs/guides/your_system.md explains unstable plants.
 """
 
 from dataclasses import dataclass
@@ -67,7 +67,7 @@ def balance(x: np.ndarray) -> np.ndarray:
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/cart_pole")) -> np.ndarray:
-    """Train, then act on the estimate; returns its rms errors after a fifth of the run, in half-widths of X.
+    """Train, then act on the estimate; returns its rms errors without the run's first fifth, in half-widths of X.
 
     Args:
         inverse_steps: number of training batches.

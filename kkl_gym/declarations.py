@@ -55,7 +55,7 @@ def _check_names(cls: Any, base: Any) -> None:
         raise TypeError(f"{cls.__name__} must set the class variables name, X and bounds; it lacks {missing[0]}")
     name = cls.name
     if not isinstance(name, str) or not name.strip() or {"/", "\\", ":"} & set(name):
-        raise _wrong(cls, "name", "a text without slash and colon, because it names files")
+        raise _wrong(cls, "name", "a non-empty text without slashes and colons, because it names files")
     if "name" not in vars(cls) and {"f", "g", "h", "step", "X"} & vars(cls).keys():
         raise TypeError(f"{cls.__name__} differs from the system {name!r} and needs a name of its own")
     variables = inspect.get_annotations(base)
@@ -109,7 +109,7 @@ def _check_inputs(cls: Any, base: Any) -> None:
         given = "g(x)" if "g" in vars(cls) else f"G = {cls.G!r}"
         raise TypeError(f"{cls.__name__}: {given} needs u_max, the bound of each input; without it there are no inputs")
     if nu and cls.g is base.g and not cls.discrete:
-        _read(cls, "G", f"{nx} rows of {nu} numbers, for {nx} states and {nu} inputs, or override g(x)", (nx, nu))
+        _read(cls, "G", f"{nx} rows of {nu} numbers, for {nx} states and {nu} inputs; or override g(x)", (nx, nu))
 
 
 def _read(

@@ -18,7 +18,7 @@ def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None, tr
     if not isinstance(artifact, Artifact):
         raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
     if flag("monitor", monitor) and artifact.limits is None:
-        parts = "limits" if artifact.knows_output else "limits and with the output h(x), which this one lacks, too"
+        parts = "limits" if artifact.knows_output else "limits and the output h(x), which this one lacks too"
         raise ValueError(
             f"this artifact for {artifact.system!r} holds no limits for a monitor; training.calibrate(artifact, "
             f"system) returns an artifact with {parts}"
@@ -130,7 +130,7 @@ def held_input(
 
 
 def first_state(artifact: Artifact, tracking: bool, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Return the filter's state (..., size) and age at the first sample (..., ny), from ``x0`` (..., nx) if given."""
+    """Return the filter's state (..., size) and age at the first sample ``y0``, from ``x0`` (..., nx) if given."""
     if x0 is None:
         return artifact.filter.start(y0), 0
     artifact.require_known_start(tracking=tracking)

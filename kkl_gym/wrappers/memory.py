@@ -113,7 +113,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         entries that are the cosine and the sine of one angle. An angle must turn by less than half a turn in a step.
     period : float, optional
         Length of a turn, for all angles that are not pairs. None: 360 if the bounds are 360 or 720 apart, 2 pi if they
-        are infinite or at most 4 pi apart. It is required for other bounds, and for bounds 1, 2 or 4 apart.
+        are infinite or at most 4 pi apart (except 1, 2 and 4). For all other bounds the period is required.
     missing : {"error", "hold"}
         On NaN among the measured entries, raise an error, or hold the last value. The first sample must be complete.
     weights : array_like, optional
@@ -130,7 +130,7 @@ class KKLMemory(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ValueError
         If the environment is not a gymnasium.Env, has other spaces or is under ``Autoreset``, if an argument is not as
         described, or if the period of an angle is unknown. At a reset or step, if a measured entry is infinite, beyond
-        1e15, or NaN (with "hold", only at a reset). At a step, if the action is infinite, beyond 1e15, or NaN.
+        1e15, or NaN (with "hold", NaN only at a reset). At a step, if the action is infinite, beyond 1e15, or NaN.
 
     Examples
     --------

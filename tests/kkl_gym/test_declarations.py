@@ -63,7 +63,7 @@ def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
     ("changes", "message"),
     [
         ({"name": LEFT_OUT}, "Tank must set the class variables name, X and bounds; it lacks name"),
-        ({"name": "a/b"}, "name = 'a/b' must be a text without slash"),
+        ({"name": "a/b"}, "name = 'a/b' must be a non-empty text without slash"),
         ({"X": ((math.nan, 1), (-1, 1))}, "X = ((nan, 1), (-1, 1)) must be (low, high) for each state"),
         ({"X": property(lambda self: ((-1, 1), (-1, 1)))}, "must be (low, high) for each state, as in"),
         ({"X": ((-1, 1), (1, 1))}, "X[1] = (1, 1) must be (low, high) with low < high"),

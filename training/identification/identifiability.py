@@ -15,7 +15,7 @@ HARDLY = 1.0  # relative standard error from which a direction counts as unident
 PART = 0.05  # a parameter whose component of a direction is smaller does not belong to the direction
 LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # largest denominator of an exponent, and relative error of its rounding
 MOST_SIGNS = 12  # largest number of states and parameters of which all combinations of signs are tested
-POINTS = 64  # states at which a symmetry is tested
+POINTS = 64  # number of random states at which a symmetry is tested
 
 
 def unidentifiable_directions(information: np.ndarray) -> np.ndarray:

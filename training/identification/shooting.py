@@ -9,12 +9,12 @@ from training.identification.identifiability import PART, identifiable_direction
 from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped
 
 RESETTLING = 3  # largest number of steps that refit a start if its window fits worse after a step of the parameters
-NONLINEAR = 0.3  # largest rms error / noise of outputs that are linearised for a parameter change of one standard error
+NONLINEAR = 0.3  # largest rms error of a predictable window's linearised outputs, in units of the noise
 ROUNDS = 40  # largest number of Gauss-Newton steps at one length of windows
 SLOW, PATIENCE = 0.1, 3  # a step that lowers chi-square per output by less is slow; PATIENCE of them in a row end a fit
 SMALL_STEP = 0.05  # in standard errors: a shorter Gauss-Newton step ends the fit
 EXACT = 1e-16  # a smaller mean square of residuals, relative to the outputs' variances, ends the fit
-ROUNDING = 1e-14  # lower bound of the noise, relative to an output's standard deviation
+ROUNDING = 1e-14  # lower bound of Fit.noise, as a share of an output's standard deviation, or of a given noise
 MOST_DAMPING = 1e9  # the fit ends if no step with a smaller damping lowers the residuals
 CLUSTERS = 20  # least number of windows whose scatter gives standard errors
 COLOURED = 1.5  # residuals are coloured if scatter raises a standard error by a larger factor, which chance hardly does
@@ -29,9 +29,9 @@ class UnexplainedError(ValueError):
 class Fit:
     """A least-squares fit: ``curvature`` is J'WJ, ``white`` and ``scattered`` are covariances of the gradient J'Wr.
 
-    J has the outputs' derivatives by parameters, with refitted starts; ``cost`` is the mean of W r^2, ``left`` the next
-    Gauss-Newton step's length in standard errors. Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny), ``noise``
-    (ny,), ``curvature``, ``white``, ``scattered`` (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
+    J has the outputs' derivatives by parameters, with refitted starts, W the weights. ``cost`` is the mean of W r^2,
+    ``left`` the next Gauss-Newton step in standard errors. Shapes: ``theta`` (p,), ``residuals`` (steps + 1, n, ny),
+    ``noise`` (ny,), the matrices (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
 
     shooting: Shooting
@@ -107,10 +107,10 @@ class Fit:
 
 
 def predictable(fit: Fit, windows: Windows) -> np.ndarray:
-    """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes of a standard error.
+    """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes of one standard error.
 
-    The outputs of long windows of a chaotic motion do not: their squared residuals have many minima, and the curvature
-    at a minimum gives no standard errors.
+    A change is at most one unit. Long windows of a chaotic motion do not respond linearly: their squared residuals
+    have many minima, and the curvature at a minimum gives no standard errors.
     """
     shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.settled(theta)
@@ -146,7 +146,7 @@ def shoot(
     """Fit parameters, and starts of windows of one length, by least squares; ``report`` receives the share done.
 
     Windows that the model explains much worse than most are left out. If the model is accurate for some motions and
-    rough for others, as models of friction are, pass the standard deviations of the ``noise``. A window then has
+    rough for others, as models of friction are, pass the noise's standard deviations as ``noise``. A window then has
     the weight 1 / (1 + c), with c its residuals' mean square in units of the noise. Steps then leave out only
     windows whose motions leave the bounds; the standard errors of the Fit still leave out outliers (``Fit.used``).
     """
