@@ -8,7 +8,7 @@ import kkl_gym
 
 
 def main(seconds: float = 10.0, seed: int = 0) -> float:
-    """Print state and estimate once a second; returns the last relative error.
+    """Print state and estimate once a second, and return the relative error at the end.
 
     Args:
         seconds: length of the run.

@@ -100,7 +100,7 @@ class Sensor:
         return bool(np.any(self.coloured_noise) or np.any(self.drop_out))
 
     def columns(self, ny: int) -> dict[str, np.ndarray]:
-        """Return all parameters by name, each (ny, 1). By default limits are infinite, and time constants are 1."""
+        """Return parameters by name, each (ny, 1): saturation as ``low`` and ``high``; unset time constants are 1."""
         low, high = (-math.inf, math.inf) if self.saturation is None else self.saturation
         given = vars(self) | {"low": low, "high": high, "time_constant": self.time_constant or 1.0}
         del given["saturation"]
@@ -113,7 +113,7 @@ class Sensor:
         return {name: np.broadcast_to(np.array(value), ny)[:, None] for name, value in given.items()}
 
     def bounds(self, low: np.ndarray, high: np.ndarray, noise: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of y for bounds (ny,) of h(x); they add six standard deviations of noise and half a quantum."""
+        """Return bounds of y for bounds (ny,) of h(x), with margins: half a quantum, six noise standard deviations."""
         of = {name: column[:, 0] for name, column in self.columns(len(low)).items()}
         ends = of["gain"] * np.stack([low, high]) + of["bias"]
         margin = 6.0 * np.hypot(noise, of["coloured_noise"]) + of["quantum"] / 2
@@ -151,7 +151,7 @@ class Readings:
     def read(self, h: np.ndarray, v: np.ndarray, rows: np.ndarray | None = None, *, start: bool) -> np.ndarray:
         """Return samples (ny, m) of environments ``rows`` (m,) at an episode's start or next step, NaN where missing.
 
-        Shapes: ``h`` (ny, m), ``v`` (ny, m) or, for a random sensor, (3 ny, m): white noise and the sensor's draws.
+        Shapes: ``h`` (ny, m); ``v``, white noise (ny, m), or for a random sensor (3 ny, m) with the sensor's draws.
         """
         rows, of, drawn = self._everyone if rows is None else rows, self._of, len(v) > self._ny
         white, fresh, chance = np.split(v, 3) if drawn else (v, None, None)

@@ -25,9 +25,9 @@ from training.files import claimed_run
 from training.progress import LOG, ProgressBars, progress_bars
 
 LOG_EVERY = 100  # batches between two entries of the error history
-CHECKPOINT_SECONDS = 20.0  # least time between two checkpoints
+CHECKPOINT_SECONDS = 20.0  # s, least time from one checkpoint to the next, except to the last of a stage
 CHECKPOINT = ".checkpoint.pt"  # suffix of checkpoint files
-WARM_UP = 0.01  # the learning rate rises over this share of a stage
+WARM_UP = 0.01  # the learning rate rises over this first share of a stage
 
 # A loss draws its batch from the given generator alone, so that a resumed run continues as if it had not stopped.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]

@@ -28,7 +28,7 @@ RANGES: dict[str, dict[bool, tuple[tuple[float, float], tuple[float, float]]]] =
     "square": {False: ((0.1, 1.0), (0.5, 2.0)), True: ((1.0, 2.0), (2.0, 4.0))},
 }
 SETTLING = 5.0  # s; errors before this time of each trial do not count
-# The best SMAPE in % that HyperKKL's paper prints for each system and each of INPUTS, within the distribution.
+# The best SMAPE in % that HyperKKL's paper prints for four systems and each of INPUTS, within training's RANGES.
 PRINTED: dict[str, tuple[float, float, float, float]] = {
     "duffing": (5.6, 21.1, 22.7, 21.3),
     "van_der_pol": (5.0, 26.0, 15.5, 17.9),
@@ -38,7 +38,7 @@ PRINTED: dict[str, tuple[float, float, float, float]] = {
 
 
 class Driven:
-    """Base of all systems: one input, in training within [-1, 1], and samples every 0.05 s.
+    """Base of the systems below: samples every 0.05 s, and one input, which stays in [-1, 1] in training.
 
     ``trial`` is a trial's duration in s, ``noise`` the noise's standard deviation, ``seen`` the measured state's index.
     """
@@ -187,7 +187,7 @@ class HyperKKL:
         return Artifact.read(path)
 
     def _measured(self, system: Any, artifact: "Artifact") -> Iterator[dict[str, Any]]:
-        """Yield mean SMAPEs after settling: of the observer, its T_inv alone, and a Kalman filter."""
+        """Yield rows with mean SMAPEs after SETTLING of the observer, its T_inv alone and an extended Kalman filter."""
         from scipy.stats.qmc import LatinHypercube
 
         from kkl_gym.simulate import simulate

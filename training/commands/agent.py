@@ -72,7 +72,7 @@ def numbers(kind: type, form: str, count: int | None = None) -> Callable[[str], 
 _INDICES = words(numbers(int, "indices in the flattened observation, as in 0,1"), "INDICES", 1)
 _PAIR = words(numbers(int, "the entries of a cosine and a sine, as in 0,1", 2), "PAIR", 1)
 _STEPS = words(numbers(float, "numbers of steps, as in 1,2"), "STEPS", 1)
-Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, in known environments")]
+Measured = Annotated[tuple[int, ...], _INDICES, hint("the positions, in Pendulum-v1 and eight others")]
 
 
 @dataclass(frozen=True)
@@ -131,11 +131,11 @@ class Train:
     ] = None
     """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
-    """For environments without --observer: number of first steps, from which an observer is learned. Without noise the
-    agent also learns in these steps, from true hidden signals, and only the latest 100,000 steps serve the observer.
-    With noise the actions are random. For --information z: random steps, from which KKLMemory learns to predict."""
+    """For environments without --observer: number of steps at the start, from which an observer is learned. Without
+    noise the agent also learns in them, from true hidden signals; only their last 100,000 serve the observer. With
+    noise actions are random. For --information z with noise: random steps, from which KKLMemory learns to predict."""
     aggregate: int = 0
-    """Number of refits of the observer to the agent's own steps while the agent learns from estimates. If it is not 0,
+    """Number of refits of the observer to the agent's own steps while the agent learns from estimates. With refits,
     the agent neither learns nor explores in the last twentieth of all steps, and a last refit follows."""
     options: tyro.conf.OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
     folder: tyro.conf.OmitArgPrefixes[RunOptions] = field(default_factory=RunOptions)
@@ -154,8 +154,8 @@ class Train:
                 raise FileExistsError(f"{folder} already holds an agent; choose another folder with --out")
             if (folder / f"agent{CHECKPOINT}").exists() and not self.folder.resume:
                 raise FileExistsError(
-                    f"{folder} holds the checkpoint of a training: continue it (--resume), remove it, or choose "
-                    "another folder with --out"
+                    f"{folder} holds the checkpoint of a training: continue the training (--resume), remove the "
+                    "checkpoint, or choose another folder with --out"
                 )
             progress.say(f"training an agent for {task.name} that sees {self.information}, in {folder}")
             agent = learn(

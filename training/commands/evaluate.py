@@ -119,11 +119,11 @@ class Evaluate:
     Trajectories start in X (the training box) and in 2X outside X, with and without noise. SMAPE, in percent, uses the
     norm of the whole state, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square
     error of each state after the transient, in percent of the state's standard deviation. The transient is the first
-    fifth of a run. In runs that random steps and sines drive, it is the first 5 s (500 samples for your own systems).
+    fifth of a run. In driven runs (by random steps and sines) it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
-    beyond a map's range are left out. A policy under which an observer was trained acts in all runs. In runs called
-    driven it sees the state with errors, and explores; in the others it sees the exact state, which u then reveals.
+    beyond a map's range are left out. A policy under which an observer was trained gives the inputs of all runs.
+    In driven runs it sees the state with errors, and explores; in the others it sees the exact state, which u reveals.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
@@ -152,7 +152,7 @@ class Evaluate:
     faults: bool = False
     """Instead of errors, report how soon the monitor detects sensor faults."""
     csv: Annotated[Path | None, NO_FILE] = None
-    """File for the results of each trajectory, or of each group of trajectories with --calibration."""
+    """File for the results of each trajectory; with --calibration, of each group of trajectories."""
     motions: tyro.conf.OmitArgPrefixes[Motions] = field(default_factory=Motions)
 
     def run(self, console: Console) -> "pd.DataFrame":

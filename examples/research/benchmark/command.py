@@ -30,7 +30,7 @@ class Benchmark:
     """
 
     budget: Literal["short", "cpu"] = "cpu"
-    """cpu: 400,000 points and 300 CPU seconds for each training. short: half of the points, 40 s."""
+    """cpu: 400,000 samples and 300 CPU seconds for each training. short: 200,000 samples and 40 CPU seconds."""
     quick: bool = False
     """Ignore the budget: train only each method's first configuration, on 300 batches, and test on few and short
     trajectories. This takes minutes, and gives the same results each time."""

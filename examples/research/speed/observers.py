@@ -18,7 +18,7 @@ from observers.machine import available
 from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.sources.simulated import unknown_start
 
-BATCHES = 10  # number of timed steps of Kalman filters on a batch of rows; few, because these filters are slow
+BATCHES = 10  # number of steps of Kalman filters on a batch of rows; few, because these filters are slow
 FEWER = 10  # divides the number of samples on which single steps in Python are timed
 
 
@@ -40,7 +40,7 @@ def in_turns(
 
 
 def seconds_of(task: Callable[[], object], count: int) -> float:
-    """Run a task; returns its CPU seconds divided by its number of steps."""
+    """Run a task, and return its CPU seconds divided by ``count``, its number of steps."""
     began = time.process_time()
     task()
     return (time.process_time() - began) / count
@@ -104,7 +104,7 @@ def observer_tasks(artifact: Artifact, system: System, *, rows: int, steps: int)
 def record_tasks(artifact: Artifact, system: System, *, rows: int, steps: int) -> dict[str, Callable[[], float]]:
     """Return tasks that time estimates along records, by the observer and, if dynamax is installed, by dynamax's EKF.
 
-    Both use the equations of the observer's tracker.
+    dynamax's EKF uses the differential equations of the observer's tracker, and is left out if the tracker has none.
     """
     y, motion, observer = noisy_samples(artifact, system, rows, steps), artifact.motion, KKLObserver(artifact)
     taken = y if rows > 1 else y[:, 0]
@@ -182,7 +182,7 @@ def _stepping(observer: Any, y: np.ndarray, u: np.ndarray, *, error_bars: bool =
 
 
 class _Filterpy:
-    """EKF of filterpy with this package's step and Jacobian of the equations, as users would write one."""
+    """filterpy's EKF as users would set it up; this repository's functions integrate and linearise the equations."""
 
     def __init__(self, kind: Any, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray) -> None:
         self._system, self._dt = system, dt
