@@ -58,8 +58,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     Raises
     ------
     ValueError
-        As for :class:`KKLEnv`. Also if ``num_envs`` is not an integer from 1 to a million, ``max_episode_steps`` is not
-        a positive integer, or the mode is unknown.
+        As for :class:`KKLEnv`. Also if ``num_envs`` is not an integer from 1 to a million, ``max_episode_steps`` is
+        neither None, -1 nor a positive integer, or the mode is unknown.
 
     Examples
     --------
@@ -139,8 +139,8 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
             One seed for each row, or a number n for the seeds n, n + 1, ...; None continues with the present
             generators.
         options : mapping, optional
-            ``"x0"`` is the start, shape (nx,) for all rows or (num_envs, nx). By default starts are drawn in
-            ``start_box``. ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset; by default all.
+            ``"x0"`` is the start, shape (nx,) for all rows or (num_envs, nx). Without it starts are drawn (see
+            ``start_box``). ``"reset_mask"``, boolean of shape (num_envs,), marks the rows to reset; by default all.
 
         Raises
         ------
@@ -291,7 +291,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return self._step
 
     def _move(self, rows: Rows, u: np.ndarray) -> Any:
-        """Advance some rows by a sampling interval; returns their rewards."""
+        """Advance some rows by a sampling interval; return their rewards."""
         before = self._x[:, rows]
         w, v = self._noise(rows)
         x = self._advance(before, u, w, self.plant.dt)
@@ -340,7 +340,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
         return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
-        """Draw new blocks of noise for some rows, each from its own generator; blocks are stored sample by sample."""
+        """Draw a new block of noise for each given row, from the row's generator; the first axis of blocks is time."""
         w, v = (np.empty((ROWS_AT_ONCE, *block.shape[:2])) for block in (self._w, self._v))
         for first in range(0, len(rows), ROWS_AT_ONCE):
             some = rows[first : first + ROWS_AT_ONCE]
@@ -394,7 +394,7 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
 
 
 def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
-    """Return Gymnasium's autoreset mode, given as such or as a text like "NextStep", or raise ValueError."""
+    """Return Gymnasium's autoreset mode, given as an AutoresetMode or a text like "NextStep", or raise ValueError."""
     if isinstance(mode, AutoresetMode):
         return mode
     return AutoresetMode(choice("autoreset_mode", mode, [known.value for known in AutoresetMode]))

@@ -104,7 +104,7 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where the trajectories start: in X, or in the multiple of X but outside X.
     driven : bool
-        Whether random steps and sines are inputs. With ``policy``: whether the policy explores and sees inexact states.
+        Whether inputs are random steps and sines, not 0. With ``policy``: whether it explores and sees inexact states.
     stream : Stream
         Stream of random numbers, for evaluation or for validation.
     process_noise : float
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return parameters' rms relative errors in % after the transient; without a plant, x ends with the parameters."""
+    """Return parameters' rms relative errors in % after the transient; without a plant, x ends with the true ones."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

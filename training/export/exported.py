@@ -49,7 +49,7 @@ class Exported:
 
     @property
     def maps(self) -> dict[str, InverseMap]:
-        """The inverse maps by name: "driven", and "free" for motion without input, if the artifact has such a map."""
+        """The inverse maps by name: "driven" and, if the artifact has one for motion without input, "free"."""
         maps = {"driven": self.artifact.inverse, "free": self.artifact.free_inverse}
         return {name: inverse for name, inverse in maps.items() if inverse is not None}
 
@@ -100,7 +100,7 @@ def tracker_numbers(motion: Motion, dt: float) -> dict[str, Any]:
 
 
 def tracker_arrays(motion: Motion) -> dict[str, np.ndarray]:
-    """Return the states' offset and scale and, for scaled states, bounds and the initial mean and covariance."""
+    """Return the states' offset and scale, and the scaled states' bounds, initial mean and initial covariance."""
     low, high, mean = ((x - motion.x_offset) / motion.x_scale for x in (motion.low, motion.high, motion.mean))
     covariance = motion.covariance / np.outer(motion.x_scale, motion.x_scale)
     scaling = {"x_offset": motion.x_offset, "x_scale": motion.x_scale}

@@ -63,7 +63,7 @@ class TrajectorySampler(Sampler):
     ``cells`` of similar age and noise, and the loss divides a sample's square error by the recent mean of its cell.
     Motions with the system's own parameters, whose errors can be smaller, have separate cells.
 
-    Shapes: ``error`` (size, size), the covariance of z's error; ``silent`` (size, k), directions of z to ignore.
+    Shapes: ``error`` (size, size), z's error covariance for a learned T; ``silent`` (size, k), z's ignored directions.
     """
 
     AGES_PER_BATCH = 32
@@ -249,7 +249,7 @@ class InverseProblem(nn.Module):
         """Return the loss (square errors divided by their cells' running means) and the cells' geometric mean error."""
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)
-        if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are not
+        if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are easy
             square = torch.cat([square, apart[:, nx:].mean(-1)])
             # All plants share these cells, lest the map return the system's own parameters for similar plants.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])

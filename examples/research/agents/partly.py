@@ -18,7 +18,7 @@ KINDS: dict[str, dict[str, Any]] = {
 }
 MEASURED = {"Pendulum-v1": [0, 1], "CartPole-v1": [0, 2], "InvertedDoublePendulum-v5": [0, 1, 2, 3, 4]}
 ANGLES = {"Pendulum-v1": ((0, 1),), "InvertedDoublePendulum-v5": ((3, 1), (4, 2))}  # indices in y of (cosine, sine)
-# Each episode multiplies each of these parameters by a log-uniform number between 1/factor and factor.
+# Each episode multiplies each parameter by its own log-uniform number between 1/f and f, where f is given here.
 FACTORS: dict[str, dict[str, float]] = {
     "Pendulum-v1": {"m": 1.3, "l": 1.3},
     "CartPole-v1": {"masspole": 2.0, "length": 2.0, "force_mag": 2.0},
@@ -28,7 +28,7 @@ FACTORS: dict[str, dict[str, float]] = {
 class Partly(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """Shows [y, state]: the outputs of a faulty sensor, then the whole observation and the parameters' factors.
 
-    With ``hold``, the last sample replaces a lost one, which is NaN otherwise.
+    With ``hold``, the last sample that arrived replaces a lost one. Without it, a lost sample is NaN.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ from training.progress import ProgressBars, progress_bars
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
 OTHERS = ("large",)  # kinds of shipped maps besides the default ones
-# Together, the timed records have HOUR times Speed.steps samples: by default, an hour at 100 Hz.
+# A timed record, or all records of a batch together, has HOUR times Speed.steps samples: by default, an hour at 100 Hz.
 HOUR = 72
 
 Tasks = Mapping[str, Callable[[], float]]
@@ -102,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Measure times of observers and filters alone; ``counts`` maps a number of rows to a number of samples."""
+        """Measure times of observers and filters alone; ``counts`` maps a number of rows to the samples of each row."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
