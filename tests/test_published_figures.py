@@ -149,7 +149,7 @@ def test_coverage_and_nees():
         rows = results(f"tracking/{system}")
         rows = rows[(rows.starts == "X") & (rows.measurement_noise > 0)]
         cells.append(f"{rows.nees.between(rows.nees_low, rows.nees_high).sum()} of {len(rows)}")
-    assert row("first four rows, noise above 0: cases with NEES within the 95 % limits for 200 runs", cells) in page(
+    assert row("first four rows, five noise levels above 0: NEES within its 95 % limits for 200 runs", cells) in page(
         ACCURACY
     )
 
