@@ -153,7 +153,7 @@ def single_kernel(system: System, motion: Motion) -> Any:
     import numba
 
     if not (motion.field.exact and motion.push.exact):
-        raise ValueError("there is a power or a remainder, which compilers round in another way: write x * x for x**2")
+        raise ValueError("there is a power or a remainder, where compilers round unlike Python: write x * x for x**2")
     nx, nu, units, size = system.nx, system.nu, motion.units, len(motion.units)
     x, u, w = ([f"{letter}{i}" for i in range(n)] for letter, n in (("x", nx), ("u", nu), ("w", nx)))
     lines = [
@@ -173,7 +173,7 @@ def single_kernel(system: System, motion: Motion) -> Any:
         f"    return {in_tuple(['nan'] * nx)}",
     ]
     jit: Any = functools.partial(numba.njit, error_model="python")  # raises ZeroDivisionError where Python does
-    # The signature has floats only, so that Numba does not compile the kernel again for an integer input bound.
+    # The signature has floats only, so that Numba does not compile the kernel again where an input is an int.
     kernel = jit((numba.float64,) * (nx + nu + nx + 1))(_assembled(motion, lines, jit))
     rng = np.random.default_rng(0)
     u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace

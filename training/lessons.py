@@ -93,8 +93,8 @@ def train(
     Raises
     ------
     ValueError
-        If ``folder`` is in use by another process, holds checkpoints of another configuration, or holds any and
-        ``resume`` is False; if almost all motions leave the system's bounds, or ``config`` differs from the source's.
+        If ``folder`` is in use by another process, holds checkpoints of another training, or holds checkpoints while
+        ``resume`` is False; if almost all motions leave the system's bounds; if ``config`` differs from the source's.
     FloatingPointError
         If the loss becomes NaN.
     """
@@ -167,8 +167,8 @@ class Maps:
 def learn_map(source: Source, run: Run) -> Maps:
     """Learn T_inv along motions of a source, transients and all noise levels included.
 
-    By default, a simulated system with inputs has two T_inv: of filtered y until an input acts, then of y and u. The
-    pipeline "spinn" follows the paper: it learns T from motions and T's equation, and then T_inv from z = T(x).
+    By default, a simulated system with inputs has two T_inv: one of filtered y, used until an input acts, then one of
+    filtered y and u. "spinn" follows the paper: it learns T from motions and T's equation, then T_inv from z = T(x).
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def _sampler(
 
 
 def _fitted(name: str, sampler: Sampler, run: Run, share: float, member: int = 0) -> MLP:
-    """Train a network that estimates x on the sampler's batches."""
+    """Train a network on the sampler's batches, so that it estimates x."""
     config, device = run.config, run.device
     inputs, x, *_ = sampler(torch.Generator(device).manual_seed(0))
     network = Network.of(config, inputs.shape[1], x.shape[1]).to(device)

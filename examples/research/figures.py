@@ -1,12 +1,12 @@
 """Draw the figures of the pages, on a light and on a dark background: ``make figures``.
 
-The data are files in docs/results, or simulations that take seconds. kkl-gym draws with the same functions. Each
+The data are files in docs/results, or short simulations. Some figures are drawn by functions of ``kkl-gym demo``. Each
 figure and animation is written twice, as NAME and NAME-dark; docs/site/hooks.py shows the file of the reader's theme.
 
 ``python -m examples.research.figures figures/portraits.gif`` draws a single figure.
 
 docs/figures/qube.png is not drawn here and has only a light version: it needs a training (examples/qube.py) and records
-that are not part of this project. docs/figures/kkl.svg is drawn by hand; only its colours are changed.
+that are not part of this project. docs/figures/kkl.svg is drawn by hand; every call writes kkl-dark.svg from it.
 """
 
 import sys
@@ -50,7 +50,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 RESULTS = DOCS / "results"
 Draw = Callable[[Path], object]
 COLOURS = 256  # number of colours that remain in a picture; this reduces the file to a third
-SEED = 7  # seed of the animations
+SEED = 7  # seed of the animations of ``kkl-gym demo``
 DT = 0.01  # s, sampling interval of the shipped systems
 EKF = "EKF with the exact equations"
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # methods in the figure of noise levels
@@ -60,7 +60,7 @@ LEVELS = (0.0, 0.5)  # measurement noise in the figure of errors over time
 SMALLEST = 0.01  # lower end of the error axis in %, under noise, in the figure of errors over time
 QUANTILES = (0.1, 0.5, 0.9)  # quantiles over runs in the figure of errors over time
 AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
-FIRST = 1.0  # s at the start, in which bands may exceed their panels
+FIRST = 1.0  # s; until then, bands may exceed the panels of errors
 # Colours of docs/figures/kkl.svg, and their replacements on a dark background.
 DARK = {
     "#fdfcf8": "#1e2129", "#ddd8c8": "#363b47", "#f1efe6": "#2a2f3a", "#e9f1fa": "#1f3044", "#fbecea": "#402523",
@@ -104,7 +104,7 @@ def agents_over_time() -> Draw:
 
 
 def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
-    """Return the drawing of states, estimates and bands of 90 % of the errors, in the run of ``kkl-gym demo``."""
+    """Return the drawing of states, estimates and 90 % bands of the errors, in the run of ``kkl-gym demo``."""
     (environment,) = shown(name, None)
     episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
     observer = load(name, environment.system.measurement_noise)

@@ -21,7 +21,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     seed of row i of the task's vector environment, this environment behaves like row i.
 
     The wrapped environment sets the noise, the starts and the length of episodes: make it with the ``env_kwargs`` of
-    ``training.agents.tasks.get_task(SYSTEM)``. In training/agents/hyperparameters, rl-zoo3's ppo.yml and sac.yml do so.
+    ``training.agents.tasks.get_task(SYSTEM)``. In rl-zoo3, hyperparameters/ppo.yml and sac.yml do so if SYSTEM ships.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], observer: str | None = None) -> None:

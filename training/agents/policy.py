@@ -1,4 +1,4 @@
-"""The algorithms of stable-baselines3, and the networks of their policies in NumPy."""
+"""The algorithms of stable-baselines3 and sb3-contrib, and the networks of their policies in NumPy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +22,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "tqc": TQC,
     "ppo_lstm": RecurrentPPO,
 }
-CONTINUOUS = ("sac", "td3", "tqc")  # algorithms that need bounded actions
+CONTINUOUS = ("sac", "td3", "tqc")  # algorithms that need continuous actions within finite bounds
 ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
 
 

@@ -14,7 +14,7 @@ from observers import Expression
 
 ASIDE = 1e-5  # step of the central differences: in widths of X for a state, in u_max for an input
 LINEAR_ROUNDING = 1e-9  # largest residual of a linear output, as a share of its largest value
-EXPRESSION_ROUNDING = 1e-6  # largest difference of an expression from the equations, as a share of a component's size
+EXPRESSION_ROUNDING = 1e-6  # largest difference of expression and equations, as a share of a component's largest value
 
 # Sympy's names of functions, and the names that expressions give them.
 _NAMES = {

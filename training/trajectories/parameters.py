@@ -47,9 +47,9 @@ def nominal_share(ranges: Ranges) -> float:
 def with_parameters(system: System, ranges: Ranges, *, in_training: bool = False) -> System:
     """Return a system whose states are x, followed by the parameters in ``ranges``, which stay constant in a motion.
 
-    An observer of this system can estimate the parameters. In training, a share of the motions has the system's own
-    parameters, which are the likeliest. The parameters of the other motions lie more often near the ends of their
-    ranges, where errors are largest.
+    An observer of this system can estimate the parameters. With ``in_training``, a share of the motions has the
+    system's own parameters, because these are the likeliest. The parameters of the other motions lie more often near
+    the ends of their ranges, where errors are largest.
     """
     if not ranges:
         return system
