@@ -59,8 +59,8 @@ class Sensor(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]):
 class Live:
     """An environment with its observer, on a figure that is redrawn continuously.
 
-    ``clock`` is the time that a sample takes in the window, in seconds; ``history`` holds x, x_hat, y and the
-    monitor's score for each sample in the drawing.
+    ``clock`` is the time in s from sample to sample in the window, where one System.pace lasts 1 s. ``history`` holds
+    x, x_hat, y and the monitor's score for each sample in the drawing.
     """
 
     def __init__(self, figure: Any, environment: Shown, measurement_noise: Level | None, *, seed: int) -> None:
@@ -120,7 +120,7 @@ class Live:
         return self.artists
 
     def press(self, key: str | None) -> None:
-        """Act on a key; ``KEYS`` lists them."""
+        """Act on a key that ``KEYS`` lists, and ignore all others."""
         if key == " ":
             self.paused = not self.paused
         elif key == "n":

@@ -32,9 +32,9 @@ class Memory:
     filter v' = (u - v) / tau itself, with u held between samples.
 
     The past before the first output is unknown. The memory assumes that y was constant until 64 steps before the first
-    output. For these 64 steps, each filter assumes the mean rate of change since the first output, with the filter's
-    weights. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory also
-    assumes that no input acted before the first output.
+    output. For these 64 steps, each filter assumes the rate of change since the first output, averaged with the
+    filter's weights. After k steps this assumption multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). The memory
+    also assumes that no input acted before the first output.
 
     Every w of a slow signal is nearly tau times the signal's rate, so that all w would carry the same information. The
     memory therefore returns combinations: the w of the slowest filter, then for each faster filter the part of its w

@@ -1,4 +1,4 @@
-"""Streams of random numbers: no two of these purposes share one, whatever their seeds."""
+"""Streams of random numbers by purpose: two purposes never share a stream, whatever their seeds."""
 
 from enum import IntEnum
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """The first entry of a seed, by purpose. Published results depend on these numbers, which never change."""
+    """The first entry of NumPy's seed, by purpose. Published results depend on these numbers, which never change."""
 
     TRAINING = 1
     EVALUATION = 2

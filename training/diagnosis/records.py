@@ -240,7 +240,7 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
 
 
 def _samples(windows: Windows, steps: int, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, at evenly spread samples, z (n, size) of filters begun ``steps`` before, and x with its change since."""
+    """Return, at evenly spread samples, z (n, size) of filters begun ``steps`` earlier, and x with its change since."""
     rows = windows.rows(steps)
     rows = rows[~np.isnan(windows.x[rows - steps]).any(-1)]
     rows = evenly(rows, min(most, len(rows)))

@@ -118,7 +118,7 @@ def _first_fit(
     lengths: Sequence[int],
     fitted: Callable[[Shooting, np.ndarray, Windows], Fit],
 ) -> Fit:
-    """Return the fit of the longest windows with small residuals, else of the shortest, with starts searched in X."""
+    """Guess starts in X; return the fit of the longest windows with small residuals, or else of the shortest ones."""
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     theta, best, problem = shooting.given, None, UnexplainedError("")
@@ -154,7 +154,7 @@ def windows(records: Sequence[Record], starts: Starts, length: int) -> Windows:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Outputs ``y`` (steps + 1, ny) of a held-out record, predicted from its first ``fitted`` samples."""
+    """Outputs ``y`` (steps + 1, ny) of a held-out record, predicted from its samples 0 to ``fitted``."""
 
     record: Record
     y: np.ndarray

@@ -1,6 +1,6 @@
-"""The budgets of trainings and the test protocols behind ``--budget`` and ``--quick``.
+"""Training budgets and test protocols, which ``--budget`` and ``--quick`` select.
 
-Durations and dt are for systems with a System.pace of 1 s; all systems have equally many samples.
+Durations and dt are for a System.pace of 1 s. They grow in proportion to it, so the number of steps stays the same.
 """
 
 import math
