@@ -136,5 +136,5 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
     if isinstance(error, IndexError) or "unpack" in str(error):
         return f": x has {len(x)} components"
     if not on_floats and not isinstance(error, NameError | KeyError | ArithmeticError):
-        return f": equations take arithmetic and the functions of kkl_gym.elementary, which take {_TYPES}"
+        return f": write equations with arithmetic and the functions of kkl_gym.elementary, which take {_TYPES}"
     return ""

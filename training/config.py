@@ -43,9 +43,9 @@ class Config:
     """
 
     pipeline: Pipeline
-    """How the observer is learned. input-aware: T_inv(z_y, z_u) is fitted along noisy trajectories with inputs, and
-    T_inv(z_y) along those without inputs, transients included. spinn: as in the paper, a physics-informed network
-    learns T, and T_inv is fitted on z = T(x) (see ``transients``), without inputs."""
+    """How the observer is learned. input-aware: T_inv(z_y, z_u), of filtered y and u, is fitted along noisy
+    trajectories with inputs, and T_inv(z_y) along those without, transients included. spinn: as in the paper, a
+    physics-informed network learns T, and T_inv is fitted on z = T(x) (see ``transients``), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A for each output, in 1/s; B feeds the output into each of its modes with weight 1."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
@@ -53,7 +53,7 @@ class Config:
     dt: Positive = 0.01
     """Sampling interval in seconds."""
     trajectories: Count = 500
-    """Number of simulated trajectories."""
+    """Simulated trajectories for each T_inv."""
     duration: Positive = 50.0
     """Length of each trajectory in seconds."""
     samples: Annotated[int, Field(ge=2)] = 200
@@ -65,7 +65,7 @@ class Config:
     activation: Literal["tanh", "silu"] = "tanh"
     """Activation of the hidden layers."""
     optimiser: Optimiser = "soap"
-    """Optimiser of all networks: adam, or soap, which needs far fewer batches."""
+    """Optimiser of the maps' networks: adam, or soap, which needs far fewer batches."""
     batch: Annotated[int, Field(ge=64, multiple_of=32)] = 1024
     """Samples in a batch. A batch for the forward map has as many collocation points in addition."""
     learning_rate: Positive = 5e-3
@@ -73,7 +73,7 @@ class Config:
     forward_steps: Annotated[int, Field(ge=0)] = 0
     """Batches for the forward map (spinn)."""
     inverse_steps: Count = 1500
-    """Batches for each inverse map."""
+    """Batches for each T_inv network."""
     collocation: Literal["motions", "box"] = "motions"
     """Points x at which the forward map's equation must hold (spinn): states of motions, or uniform in the box X."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
@@ -97,8 +97,8 @@ class Config:
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse T_inv(z_y), used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
-    """Some trajectories without inputs start where a phase with inputs has led, mostly outside X: with constant inputs
-    up to this multiple of their bounds for 20 time units (pace), or if it is 0, with random inputs for 10 units."""
+    """Some trajectories without inputs start where earlier inputs have led, mostly outside X. These inputs are constant
+    over 20 paces, up to this multiple of their bounds; with 0, random over 10 paces."""
     process_noise_share: Share = 0.35
     """Share of trajectories with process noise (input-aware); with 0, its level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0
@@ -120,7 +120,7 @@ class Config:
     tracking: bool = True
     """Whether a Kalman filter tracks the state (not spinn); it predicts by equations or a flow, a learned network."""
     flow_steps: Count = 5000
-    """Batches for a learned flow, which replaces unknown equations and those that an artifact cannot hold."""
+    """Batches for a flow, which replaces unknown equations and those that an artifact cannot hold."""
     runs: Annotated[int, Field(ge=100)] = 400
     """Number of simulated motions on which covariances and the monitor's limits are calibrated."""
     false_alarms: Annotated[float, Field(gt=0, lt=1)] = 0.01
@@ -131,7 +131,7 @@ class Config:
     """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
     deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
     bias: Biases = 0.0
-    """Largest constant bias of all outputs, or of each; T_inv estimates biases (input-aware, without ``uncertain``)."""
+    """Largest constant bias (one, or one per output); T_inv estimates biases (input-aware, without ``uncertain``)."""
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None

@@ -25,10 +25,10 @@ _ARRAYS = ("t", "y", "u", "x")  # arrays of a record
 class Checkpoint(BaseCallback):
     """Writes a checkpoint and the learning curve at the end of a training and, at intervals, between two rollouts.
 
-    A checkpoint holds networks, optimisers, counters, the scaling of observations and returns, the replay buffer, the
+    A checkpoint holds networks, optimisers, counters, the scaling of observations and rewards, the replay buffer, the
     learning curve, KKLMemory's weights and the recorded samples that train an observer. It holds neither environments
     nor random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
-    row for each episode: steps, CPU seconds and return.
+    row for each episode: the training's steps and CPU seconds at its end, and its return.
     """
 
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:
@@ -126,7 +126,7 @@ def _moments(scaling: VecNormalize | None) -> dict[str, Any]:
 
 
 def _buffer(model: OffPolicyAlgorithm) -> dict[str, Any]:
-    """Return the filled part of the replay buffer, and the entropy coefficient if SAC or TQC learns it."""
+    """Return the filled part of the replay buffer, and the log of the entropy coefficient if SAC or TQC learns it."""
     buffer, weight = model.replay_buffer, getattr(model, "log_ent_coef", None)
     assert buffer is not None
     rows = buffer.size()

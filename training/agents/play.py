@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.wrappers.vector import VectorEnv
 
 Policy = Callable[[np.ndarray], Any]
-SIGNALS = ("x", "x_hat", "y")  # keys of info whose values are recorded at each action
+SIGNALS = ("x", "x_hat", "y")  # keys of info whose values are recorded at reset and after each step
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
 INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states, both scaled by typical sizes
 POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
-POLICY_ERROR = (0.02, 0.5)  # range of errors in the states that a policy sees, in multiples of the system's scale
+POLICY_ERROR = (0.02, 0.5)  # range of a motion's bound of errors in the state that a policy sees, in System.scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
 # One in this many trajectories follows the policy exactly. The exact policy's input reveals the state; an agent's
 # input, which depends on x_hat, does not. If a regulator acts on x_hat, at the default noise, the error of cart-pole's
@@ -274,7 +274,7 @@ def linear_quadratic(system: System, dt: float) -> Controller:
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     """Return a policy that checks the shape of its actions; ValueError if its actions at drawn states are invalid."""
     if not system.nu:
-        raise ValueError(f"{system.name} has no inputs, so that the policy {name!r} cannot act")
+        raise ValueError(f"{system.name} has no inputs, so the policy {name!r} cannot act")
 
     def act(x: np.ndarray) -> np.ndarray:
         try:
@@ -295,7 +295,7 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     actions = act(x)
     for row in np.flatnonzero(~(np.abs(actions) <= 1.0).all(-1)):
         raise ValueError(
-            f"the policy {name!r} must return actions in [-1, 1], which scale inputs up to u_max = {system.u_max}; "
+            f"the policy {name!r} must return actions in [-1, 1], in multiples of u_max = {system.u_max}; "
             f"at x = {x[row].tolist()} it returns {actions[row].tolist()}"
         )
     return act
