@@ -25,8 +25,8 @@ UNITS = 1.0, 2.0, 4.0
 class Outputs:
     """The measured outputs in an environment's observations.
 
-    Their order is that of :func:`gymnasium.spaces.flatten`: boxes row by row, the parts of a Dict or Tuple one after
-    the other, and Discrete values one-hot. If ``measured`` holds keys, only those keys of a Dict are read. Images in a
+    Entries are numbered as by :func:`gymnasium.spaces.flatten`, with Discrete values one-hot. Outputs have this order,
+    or that of the indices in ``measured``. If ``measured`` holds keys, only those keys of a Dict are read. Images in a
     Dict are left out, but raise an error if ``measured`` holds indices.
     """
 

@@ -18,7 +18,7 @@ NOISE_FLOOR = 0.002  # least measurement noise that a filter assumes, in multipl
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
-    """Return the covariance (ny, ny) of assumed noise on y; its level is at least ``NOISE_FLOOR`` of the default."""
+    """Return the covariance (ny, ny) of assumed noise on y; the level is at least ``NOISE_FLOOR`` times the default."""
     least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
@@ -79,7 +79,7 @@ class ExtendedKalmanFilter:
         """Return means (steps + 1, n, nx) and covariances for samples (steps + 1, n, ny) and inputs (steps, n, nu).
 
         Given motions x (steps + 1, n, nx), the filter linearises f about them, and h about predictions from them. With
-        the plant's own noise this gives the posterior Cramér-Rao bound of each motion (Tichavsky et al., 1998).
+        the plant's own Q and R, the covariances are each motion's posterior Cramér-Rao bound (Tichavsky et al., 1998).
         """
         state, states = self.start(y.shape[1]), []
         for k in range(len(y)):

@@ -48,7 +48,7 @@ class Profile:
 
 
 def homogeneous(system: System, dt: float) -> Controller:
-    """Return the feedback u = b x1 - 2 (x2 + cbrt(a x1)), saturated, for the system x1' = a x2^3, x2' = -b x1 + u.
+    """Return the saturated u / u_max with u = b x1 - 2 (x2 + cbrt(a x1)), for the system x1' = a x2^3, x2' = -b x1 + u.
 
     There is no linear-quadratic regulator, as the linearisation at the origin cannot be stabilised. This feedback
     cancels -b x1 and makes x2 follow -cbrt(a x1), for which x1' = -a^2 x1.
@@ -64,7 +64,7 @@ def homogeneous(system: System, dt: float) -> Controller:
 
 
 def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Space eigenvalues evenly in the logarithm, and round them as the shipped maps have them."""
+    """Space eigenvalues evenly in the logarithm, and round them to six decimals, as in the shipped maps."""
     return tuple(np.round(evenly_spaced(n, slowest, fastest), 6).tolist())
 
 
@@ -79,7 +79,7 @@ PROFILES: dict[str, Profile] = {
     "van_der_pol": Profile(
         # Fast modes follow the jumps of y, and slow ones average its noise; this range gave the smallest errors.
         eigenvalues=_spaced(15, -0.4, -20.0),
-        # Slower modes would have a rougher T; more modes average more of the noise.
+        # Slower modes would make T rougher; fewer modes would average less of the noise.
         spinn_settings={"eigenvalues": _spaced(11, -4.0, -16.0), "noise_free_share": 0.2, "high_noise_emphasis": 4.5},
         # High noise levels are drawn more often, as they make the phase hard to estimate. Inputs within their bound
         # cannot drive the oscillator out of X, so stronger inputs before some trajectories do.
@@ -94,8 +94,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. Pairs 1 and 2
-        # cut the best T_inv's error from 2.3 to 1.9 % (parameters 10 % off); more training cut it by a relative 3 %.
+        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. With a plant
+        # 10 % off, pairs 1 and 2 cut T_inv's least error from 2.3 to 1.9 %; more training cut errors by a relative 3 %.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,

@@ -32,7 +32,7 @@ class Engine:
         attempt = delayed(partial(_attempt, run, Path.cwd()))
         while todo:
             # Each worker has one job at a time, so the job of a dead worker is among the first ones that are not done.
-            # These suspects then run one by one, since joblib may drop results of jobs that ran beside a dead worker.
+            # These suspects then run one by one, because joblib may also drop the results of jobs beside a dead worker.
             suspects = [index for index in todo if lost[index]]
             handed = 1 if suspects else workers
             begun = suspects[:1] or list(todo)
@@ -73,7 +73,7 @@ def engine(workers: int) -> Iterator[Engine]:
 
 
 def _end_with(parent: int) -> None:
-    """End this worker soon after its parent is killed; otherwise loky's workers finish their jobs."""
+    """End this worker soon after its parent is killed; loky alone would let it finish its job."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -118,7 +118,7 @@ def learn(
     if information == "recurrent" and name != RECURRENT:
         raise ValueError(f"recurrent agents learn by {RECURRENT} only, got {name!r}")
     if aggregate and (task.system is not None or information not in ESTIMATED):
-        raise ValueError(f"aggregate needs x_hat in an environment, not a system; got {information!r} of {task.env_id}")
+        raise ValueError(f"aggregate needs x_hat or x_hat_std, and no system; got {information!r} of {task.env_id}")
     if task.system is not None and information in OBSERVED and observer is None and show is make:
         observer = observer_of(get_system(task.system))
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
@@ -276,7 +276,7 @@ class Learner:
         first = agent_training_seed(self._seed, checkpoint.restarts, vec_env.num_envs)
         if checkpoint.restarts:
             self.model.set_random_seed(first)
-        # The model has seeded the environments with its own seed.
+        # This seed replaces the model's own, with which the model has seeded the environments.
         vec_env.seed(first)
 
     def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:

@@ -42,7 +42,7 @@ Kind = Literal[
 KINDS: tuple[Kind, ...] = get_args(Kind)
 ON_SYSTEMS: tuple[Kind, ...] = ("state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state")
 IN_ENVIRONMENTS: tuple[Kind, ...] = ("state", "x_hat", "z", "stacked", "recurrent", "y")
-IDLE: Literal["random"] = "random"  # zero input on systems, random actions in environments; normalised score 0
+IDLE: Literal["random"] = "random"  # zero input on systems, random actions in environments; the 0 of normalised scores
 # The information that agents of these kinds see; all other kinds have the name of their information.
 SEEN: dict[str, Information] = {"ekf": "x_hat", "recurrent-state": "state"}
 # For some settings of a task: the kinds of agents that depend on the setting.
@@ -86,7 +86,7 @@ class ComparedAgent(Job):
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All that the agent depends on: task, hyperparameters, content of the observer, version of the package."""
+        """All on which the result depends, except kind and seed, which are in the folder's name."""
         task = asdict(self.task)
         for setting, kinds in CONCERNED.items():
             if self.kind not in kinds:
@@ -204,7 +204,7 @@ def planned(
 
 
 def seeds_in(out: Path) -> int:
-    """Return 1 + the largest seed in the agents' folders, OUT/jobs/TASK/KIND/SEED."""
+    """Return 1 + the largest seed in the agents' folders, OUT/jobs/TASK-NOISE/KIND/SEED."""
     return 1 + max((int(path.name) for path in out.glob("jobs/*/*/*") if path.name.isdigit()), default=-1)
 
 

@@ -100,7 +100,7 @@ class Training(Job):
         write(self.folder / self.result, errors.to_csv(index=False, float_format="%.4g"))
 
     def _chosen(self) -> tuple[Configuration, list[float]]:
-        """Return the best configuration in validation, and the SMAPE of each; without a search, the first and []."""
+        """Return the configuration of least validation SMAPE, and all SMAPEs; without a search, the first and []."""
         method, system = get_method(self.method), get_system(self.system)
         configurations = method.configurations(system)
         if not 1 <= len(configurations) <= 3:

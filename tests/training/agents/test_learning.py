@@ -195,7 +195,7 @@ def test_an_observer_is_refitted_to_the_agents_own_episodes(tmp_path, small, mon
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"information": "z", "aggregate": 2}, "aggregate needs x_hat in an environment"),
+        ({"information": "z", "aggregate": 2}, "aggregate needs x_hat or x_hat_std, and no system"),
         ({"information": "recurrent", "algorithm": "ppo"}, "recurrent agents learn by ppo_lstm"),
         ({"information": "x_hat_std"}, "a trained observer with error bars"),
         ({"information": "x_hat", "timesteps": 4}, r"4 steps are too few .*--timesteps"),
