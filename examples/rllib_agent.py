@@ -20,7 +20,7 @@ import kkl_gym
 def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
     """Make batched environments with their observer inside: episodes of 20 s, an action every 0.05 s.
 
-    RLlib calls this function in each env runner, with names as its only arguments. The env runner itself imports
+    RLlib calls this function in each env runner; ``config`` holds only names and numbers. The env runner itself imports
     kkl_gym and reads the observer's file.
     """
     envs = gym.make_vec(

@@ -18,8 +18,7 @@ _POINTER = types.CPointer(types.float64)
 _SIGNATURE = types.void(_POINTER, _POINTER, types.int64, types.float64)
 _kernel, _part = kernel(**OPTIONS), part(**OPTIONS)
 
-# tanh(x)/x as a quotient of polynomials in x^2, with a relative error of 2e-8, or 4e-7 with float32 rounding. The
-# compiler vectorises it.
+# tanh(x)/x as a quotient of polynomials in x^2, relative error < 4e-8 (< 4e-7 in float32). The compiler vectorises it.
 _P = tuple(map(np.float32, (2.40733336e-11, -1.48956287e-08, 9.93605136e-06, 2.99177715e-03, 1.29846185e-01, 1.0)))
 _Q = tuple(map(np.float32, (2.38041306e-04, 2.40518041e-02, 4.63179380e-01, 1.0)))
 _END = np.float32(7.90531110763549805)  # larger arguments count as this one: tanh(x) is 1 within 3e-7
@@ -63,7 +62,8 @@ def _activate(h: Any, width: int, kind: int) -> None:
 def evaluate(packed: Any, shape: Any, between: Any) -> Any:
     """Evaluate a network for one sample, the first row of ``between``. Returns a pointer to the network's outputs.
 
-    ``shape`` holds the activation and the widths. Layers overwrite ``between``, (2, largest width + UNROLLED).
+    ``packed`` holds biases and weights, ``shape`` the activation and the widths. Layers overwrite ``between``, of shape
+    (2, largest width + UNROLLED).
     """
     h, into, at = offset(between, 0), offset(between, between.shape[1]), 0
     for layer in range(1, len(shape) - 1):
@@ -123,9 +123,9 @@ def decode_one(z: Any, age: float, network: Any, out: Any) -> None:
 
 @functools.cache
 def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> Any:
-    """Compile equations to a function that moves all sigma points of W rows in place, by Runge-Kutta or discrete steps.
+    """Compile equations to a function that moves sigma points in place, by Runge-Kutta or discrete steps.
 
-    One array (nx + nu, points, W) holds the states and inputs of all sigma points.
+    One array (nx + nu, points, W) holds the states and inputs of all sigma points, for W rows of the batch.
     """
     wide, field, inputs = (2 * nx + 1) * W, expression.python("field", nx, nu), [f"u{j}" for j in range(nu)]
     states = [f"x{i}" for i in range(nx)]
@@ -151,7 +151,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """Compile h(x) to a function that writes outputs (ny, points, W) at the sigma points (nx, points, W) of W rows."""
+    """Compile h(x): outputs (ny, points, W) are written at sigma points (nx, points, W), for W rows of the batch."""
     wide, ny = (2 * nx + 1) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))

@@ -72,7 +72,7 @@ def run_and_report(
     what: str,
     report: Callable[[ProgressBars], None],
 ) -> None:
-    """Run the missing jobs, and report on the results, even if the run is interrupted."""
+    """Run the jobs that are not done, then report on the results, also after an interruption or an error."""
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:
@@ -86,7 +86,7 @@ def run_and_report(
 def run_missing(
     run: Callable[[Job], None], jobs: Sequence[Job], *, workers: Workers, what: str, progress: ProgressBars
 ) -> list[str]:
-    """Run the missing jobs; returns the failures."""
+    """Run the jobs that are not done; returns a text for each job that failed."""
     todo, failures = [job for job in jobs if not job.done], list[str]()
     names = [job.name for job in todo]  # engine() starts jobs in this order, so the first ones are running
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))

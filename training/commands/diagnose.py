@@ -50,7 +50,7 @@ class Diagnose:
     episodes), or recorded data (--data without NAME). The command takes about ten seconds.
 
     For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and
-    bounds each state's error. For data and environments it reports whether y and u determine each hidden
+    reports each state's least error. For data and environments it reports whether y and u determine each hidden
     signal, over which window and under how much noise. The exit status is 1 if there is a problem.
     docs/guides/diagnose.md explains the lines.
     """
@@ -62,8 +62,8 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("a system's; else 1 % and 10 % of y's standard deviation")] = None
-    """Noise levels to check besides 0: standard deviations on each sample of y. 0.1,0.3 has a level for each output."""
+    measurement_noise: Annotated[NoiseLevels, hint("system: its own; else 1 and 10 % of y's standard deviation")] = None
+    """Noise levels to check besides 0: standard deviations of y's noise. 0.1,0.3 gives a level for each output."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""
     duration: Annotated[float | None, hint("the system's")] = None
@@ -73,7 +73,7 @@ class Diagnose:
     script.py:function. For an environment, as in `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
-    """Seed of the environment's episodes, and of the samples that are predicted from others."""
+    """Seed of the episodes, the test samples and the noise on y."""
     json: Annotated[Path | None, NO_FILE] = None
     """File for the findings in JSON."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)

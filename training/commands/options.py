@@ -110,17 +110,12 @@ SystemName = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM"
 OneSystem = Annotated[tyro.conf.Positional[str | None], hint("all four that ship", metavar="[SYSTEM]", help=SYSTEM)]
 OwnSystem = Annotated[
     str | None,
-    hint(
-        metavar="CLASS",
-        help="The system of the observers, if it is your own, as script.py:Class or module:Class.",
-    ),
+    hint(metavar="CLASS", help="The system of the observers, if it is your own, as script.py:Class or module:Class."),
 ]
 OneObserver = Annotated[
     str | None,
     hint(
-        "the system's shipped map",
-        metavar="MAP",
-        help="An observer for SYSTEM: a shipped map or a .safetensors file.",
+        "the system's shipped map", metavar="MAP", help="An observer for SYSTEM: a shipped map or a .safetensors file."
     ),
 ]
 Observers = Annotated[tyro.conf.Positional[tuple[str, ...]], hint(metavar="[MAP [MAP ...]]")]
@@ -162,7 +157,11 @@ class RunOptions:
     """The folder of a training, and how it runs."""
 
     out: Annotated[
-        Path | None, hint("runs/NAME; identify: as above; agents: runs/agents/NAME-INFORMATION-SEED", metavar="FOLDER")
+        Path | None,
+        hint(
+            "runs/NAME; identify: runs/NAME-identified or -adapted; agents: runs/agents/NAME-INFORMATION-SEED",
+            metavar="FOLDER",
+        ),
     ] = None
     """Folder for all files."""
     resume: bool = False
@@ -232,7 +231,7 @@ class PlayOptions:
 
     episodes: Annotated[int | None, hint("no limit")] = None
     """Episodes to play."""
-    steps: Annotated[int | None, hint("without --episodes 100,000, in diagnose 10,000")] = None
+    steps: Annotated[int | None, hint("100,000 (diagnose: 10,000) without --episodes")] = None
     """Largest number of steps to play."""
     env_kwargs: EnvironmentArguments = ()
 
@@ -312,6 +311,6 @@ def system_of(artifact: Artifact, given: str | None) -> System:
 
 
 def model_of(artifact: Artifact, system: System) -> System:
-    """Return a system with additional states: the biases that an artifact estimates."""
+    """Return a system with the biases that an artifact estimates, if any, as additional states."""
     bias = artifact.training.get("bias", 0.0)
     return with_bias(system, bias) if np.any(bias) else system

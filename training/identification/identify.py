@@ -15,8 +15,8 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # of the pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
-KEPT_RATIOS = 100.0  # prior variance of log(factor common to all parameters) / prior variance of log(factor of one)
+HELD_OUT = 10  # of the long enough pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
+KEPT_RATIOS = 100.0  # prior variance of log(factor common to all parameters) / that of log(factor of each parameter)
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(...), tried until one leaves the fit about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
@@ -80,7 +80,7 @@ class Identified:
             if self.unscaled_states:
                 lines.append(f"the scale of {', '.join(self.unscaled_states)} is not identifiable: these values set it")
         lines += [
-            f"the outputs stay the same if {', '.join(names)} change sign: the signs are not identifiable"
+            f"a common change of sign of {', '.join(names)} leaves the outputs the same: the signs are not identifiable"
             for names in self.symmetries
         ]
         for j, (noise, expected) in enumerate(zip(self.noise, self.expected_noise, strict=True)):

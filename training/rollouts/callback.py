@@ -47,7 +47,7 @@ class Refit:
 
 
 class KKLTrainingCallback(BaseCallback):
-    """Refits the observer in :class:`kkl_gym.KKLObservation` on the episodes of the agent that is being trained.
+    """Refits the observer in :class:`kkl_gym.KKLObservation` or KKLVectorObservation on the learning agent's episodes.
 
     An observer is accurate where its rollouts have been, but an agent in training goes elsewhere. A refit learns T_inv,
     the covariances and the model of the motion again, from all kept episodes but a held-out share. The new observer
@@ -90,7 +90,7 @@ class KKLTrainingCallback(BaseCallback):
     Raises
     ------
     ValueError
-        If an argument is invalid. At the beginning of the training, if an environment lacks KKLObservation, if
+        If an argument is invalid. At the beginning of the training, if an environment has no observer, if
         observers differ or were not learned from rollouts, or if a record is of another plant. At a step, if ``info``
         lacks the hidden signals, or a wrapper skips samples.
     """
