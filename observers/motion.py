@@ -77,9 +77,9 @@ class Flow:
 
     def __post_init__(self) -> None:
         nx = self.mlp.outputs
-        if self.u_scale.ndim != 1 or self.mlp.inputs != nx + len(self.u_scale):
-            raise ArtifactError(f"a flow's network must have {nx + len(self.u_scale)} inputs, got {self.mlp.inputs}")
-        check_shapes(self, {"linear": (nx, 1 + self.mlp.inputs), "gain": (nx,)})
+        if self.mlp.inputs < nx:
+            raise ArtifactError(f"a flow's network must have at least {nx} inputs, got {self.mlp.inputs}")
+        check_shapes(self, {"linear": (nx, 1 + self.mlp.inputs), "gain": (nx,), "u_scale": (self.mlp.inputs - nx,)})
         if not (self.u_scale > 0).all():
             raise ArtifactError(f"u_scale of a flow must be positive, got {self.u_scale}")
 

@@ -339,7 +339,7 @@ class Gathering:
             self._pieces.append(self._open[row])
             self._made += 1
         piece = self._open[row]
-        piece.y, piece.x = [*y], [*x]
+        piece.y, piece.x, piece.sample = [*y], [*x], 0
         return piece
 
     def _record(self, piece: _Piece) -> Record:

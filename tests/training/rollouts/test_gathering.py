@@ -37,6 +37,10 @@ def test_an_unfinished_episode_is_not_dropped(spy):
     gathering.records()
     gathering.add(0, sample(6))
     assert [len(record.t) for record in gathering.records()[0]] == [7, 11]
+    gathering.begin(0, {})
+    gathering.add(0, sample(200))  # the first sample of a learning that begins within an episode
+    gathering.begin(0, sample(0))  # the episode ends without a step
+    gathering.add(0, sample(1))
 
 
 @pytest.mark.parametrize("share", [0.2, 0.6])
