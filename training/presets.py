@@ -71,7 +71,7 @@ def _spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": Profile(
         eigenvalues=_spaced(13, -0.2, -8.0),
-        # The paper's eigenvalues suffice, as motions of this system neither diverge nor converge.
+        # Neighbouring motions neither separate nor approach fast: T is smooth even with the paper's slow eigenvalues.
         spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
         controller=homogeneous,
         fault_deadline=10.0,  # longer than the period of motions from (1, 0), 6.2 s, and from (0, 1), 7.4 s
@@ -94,8 +94,8 @@ PROFILES: dict[str, Profile] = {
     ),
     "rossler": Profile(
         eigenvalues=_spaced(13, -0.4, -8.0),
-        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. With a plant
-        # 10 % off, pairs 1 and 2 cut T_inv's least error from 2.3 to 1.9 %; more training cut errors by a relative 3 %.
+        # Under noise, real modes hardly distinguish the parameters; slow pairs at frequencies of y do. For parameters
+        # 10 % off, two pairs lower the error predicted for the best T_inv from 2.3 to 1.9 %; a third lowers it little.
         uncertain_settings={
             "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
             "width": 192,
@@ -152,7 +152,7 @@ def preset(
 
     Maps that ship were trained with "fast", which takes about half a minute of CPU time, ten minutes for the size
     "large", and five for spinn. "paper" takes its sizes from the paper's sec. 8, which does not state the batch (here
-    4,096), the spacing of the eigenvalues (here even) or the decay of the learning rate (here a cosine).
+    4,096), the spacing of the eigenvalues (even for spinn) or the decay of the learning rate (here a cosine).
 
     Parameters
     ----------

@@ -81,18 +81,18 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     noise_free = results[results.noise == "0"]
     if len(noise_free):
         component = summarise(noise_free, "component_late").set_index(["system", "method", "starts"])
-        lines += [
-            "## Component-wise SMAPE in % after the first 20 %, no noise",
-            "",
-            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets the figures that the notebooks released with "
-            "the paper print for 1.5X \\ X, from other networks, budgets and data; docs/results/benchmark.md has more.",
-            "",
-            *_by_method(methods, partial(_beside_printed, component["median"])),
-        ]
+        rows = _by_method(methods, partial(_beside_printed, component["median"]))
+        text = "Median for starts in X / 1.5X \\ X / 2X \\ X."
+        if any(" (" in cell for row in rows for cell in row.split("|")[2:]):
+            text += (
+                " In brackets the figures that the notebooks released with the paper print for 1.5X \\ X, from other "
+                "networks, budgets and data; docs/results/benchmark.md has more."
+            )
+        lines += ["## Component-wise SMAPE in % after the first 20 %, no noise", "", text, "", *rows]
     costs = methods.set_index(["system", "method"])
     lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "The best on validation runs; the first if nothing was searched.", ""]
+    lines += ["## Configuration", "", "The best on validation runs, where a method has several configurations.", ""]
     lines += _by_method(methods, partial(_configuration, costs))
     write(path, "\n".join(lines) + "\n")
 

@@ -1,6 +1,6 @@
 """Ablation: two series of pipelines, trained for equal times. Each pipeline differs from the next in a few settings.
 
-One series leads from the paper's SPINN to the package's, the other from a T_inv trained without noise to ``Default``.
+One series leads from the paper's SPINN to the package's, the other from a T_inv trained without noise to T_inv alone.
 """
 
 from collections.abc import Callable, Mapping
