@@ -50,9 +50,9 @@ class Diagnose:
     episodes), or recorded data (--data without NAME). The command takes about ten seconds.
 
     For a system it checks the equations (on floats, arrays and symbols), motions, sampling, outputs and noise, and
-    reports each state's least error. For data and environments it reports whether y and u determine each hidden
-    signal, over which window and under how much noise. The exit status is 1 if there is a problem.
-    docs/guides/diagnose.md explains the lines.
+    reports the least error of each state that an unbiased observer can reach. For data and environments it reports
+    whether y and u determine each hidden signal, over which window and under how much noise. The exit status is 1 if
+    there is a problem. docs/guides/diagnose.md explains the lines.
     """
 
     name: Annotated[
@@ -73,7 +73,7 @@ class Diagnose:
     script.py:function. For an environment, as in `kkl-gym record`."""
     parameters: Parameters = ()
     seed: int = 0
-    """Seed of the episodes, the test samples and the noise on y."""
+    """Seed of the episodes, the test samples and the noise on y; without effect for a system."""
     json: Annotated[Path | None, NO_FILE] = None
     """File for the findings in JSON."""
     play: tyro.conf.OmitArgPrefixes[PlayOptions] = field(default_factory=PlayOptions)

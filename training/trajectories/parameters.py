@@ -12,7 +12,7 @@ from training.trajectories.motions import Controller
 
 # With k uncertain parameters, a share NOMINAL_SHARE ** k of the training motions has the system's own values, and
 # the other motions have other values. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6 and layers
-# of 256 units, the map of lorenz no longer distinguished the system's own parameters.
+# of 256 units, the map of lorenz no longer distinguished a plant with the system's own parameters from others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
 EVERY = "all"  # stands for every parameter that is not named
@@ -132,7 +132,7 @@ def _with_constants(
             return outputs(x)
 
         def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])  # with the system's own parameters: a formula for the rate may need numbers
+            return system.rate(x[:nx])  # with the own parameters: a user's formula may not accept arrays
 
         if system.discrete:
 
