@@ -256,9 +256,9 @@ def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[R
     state, found = kalman_filter.start(y.shape[1]), []
     for k, (cosine, sine, alpha_dot, theta_dot) in enumerate(np.moveaxis(signals, -1, 1)):
         state = kalman_filter.advance(state, y[k])
-        alpha = state.x[:, 1]
+        alpha = state.x[:, 1] + zero
         lost = (np.hypot(np.cos(alpha) - cosine, np.sin(alpha) - sine) > APART) | (k * DT <= STARTED)
-        x = np.stack([y[k, :, 0], np.arctan2(sine, cosine), theta_dot, alpha_dot, 0.0 * alpha], -1)
+        x = np.stack([y[k, :, 0], np.arctan2(sine, cosine) - zero, theta_dot, alpha_dot, 0.0 * alpha], -1)
         P = np.where(lost[:, None, None], np.diag(SURE) ** 2, state.P)
         state = state._replace(x=np.where(lost[:, None], x, state.x), P=P)
         found.append(state.x)
