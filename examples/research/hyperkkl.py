@@ -187,7 +187,7 @@ class HyperKKL:
         return Artifact.read(path)
 
     def _measured(self, system: Any, artifact: "Artifact") -> Iterator[dict[str, Any]]:
-        """Yield rows with mean SMAPEs after SETTLING of the observer, its T_inv alone and an extended Kalman filter."""
+        """Yield rows with mean SMAPEs of the observer, its T_inv alone and an extended Kalman filter."""
         from scipy.stats.qmc import LatinHypercube
 
         from kkl_gym.simulate import simulate

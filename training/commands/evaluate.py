@@ -123,14 +123,14 @@ class Evaluate:
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
     beyond a map's range are left out. A policy under which an observer was trained gives the inputs of all runs.
-    In driven runs it sees the state with errors, and explores; in the others it sees the exact state, which u reveals.
+    In those called driven it explores, and sees the state with errors; in the others it sees the exact state.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
 
     --faults: from the middle of each run the sensor is biased by a fifth of the output's range, dead (y = 0), or frozen
-    at its last value. Half of the runs are driven, if the observer takes inputs. The time in which the monitor should
-    detect a fault is chosen for each shipped system; for other systems it is a fifth of the duration.
+    at its last value. Half of the runs are driven, if the observer takes inputs; under a policy, all. The time in which the
+    monitor should detect a fault is chosen for each shipped system; for other systems it is a fifth of the duration.
     """
 
     observers: Observers

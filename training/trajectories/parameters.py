@@ -132,7 +132,7 @@ def _with_constants(
             return outputs(x)
 
         def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])  # with the own parameters: a user's formula may not accept arrays
+            return system.rate(x[:nx])  # not with arrays as parameters, which a user's formula may refuse
 
         if system.discrete:
 
