@@ -129,8 +129,8 @@ class Evaluate:
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.
 
     --faults: from the middle of each run the sensor is biased by a fifth of the output's range, dead (y = 0), or frozen
-    at its last value. Half of the runs are driven, if the observer takes inputs; under a policy, all. The time in which the
-    monitor should detect a fault is chosen for each shipped system; for other systems it is a fifth of the duration.
+    at its last value. Half of the runs are driven, if the observer takes inputs; under a policy, all. The time in which
+    the monitor should detect a fault is chosen for each shipped system, and is a fifth of the duration for others.
     """
 
     observers: Observers
