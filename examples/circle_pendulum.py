@@ -56,7 +56,7 @@ class CirclePendulum(kkl_gym.System):
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
-    """Train, then swing up by the estimate; returns its rms errors after a fifth of the run, in half-widths of X.
+    """Train, then swing up by the estimate; returns rms errors of x_hat after a fifth of the run, in half-widths of X.
 
     Args:
         inverse_steps: number of training batches.

@@ -1,6 +1,6 @@
 """Your own task, from plant to agent: a motor brings an unmeasured link to a goal angle through a spring.
 
-The commands for the observer and for the agent on its estimate (docs/guides/own_task.md has more)::
+These commands train the observer, and an agent that acts on its estimate (docs/guides/own_task.md has more)::
 
     kkl-gym train examples/own_task.py
     kkl-gym agent train examples/own_task.py --observer runs/flexible_joint/flexible_joint.safetensors

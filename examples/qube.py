@@ -16,7 +16,7 @@ each run twice: as recorded, and mirrored, with the signs of both angles changed
 map sees changes of the arm's angle, not the angle itself.
 
 Eight runs contain few of the possible swings of a pendulum. Therefore a second observer also learns from motions
-that the device's equations simulate from random states, with parameters that were fitted to the same eight runs.
+simulated from random states by the device's equations, whose parameters were fitted to the same eight runs.
 
 While the arm sticks, its angle carries no information, and the pendulum swings on regardless. Therefore a third
 estimator is a Kalman filter with a model whose arm can stick. The second observer starts this filter, and restarts it

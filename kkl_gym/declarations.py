@@ -15,7 +15,7 @@ _SIZES = {"nx": "X", "nu": "u_max", "ny": "h(x)", "parameters": "the fields"}
 
 
 def complete(cls: Any, base: Any) -> None:
-    """Check a system's class variables, make tuples of numbers, and give missing variables their defaults."""
+    """Check a system's class variables, convert sequences to tuples, and give missing variables their defaults."""
     _check_names(cls, base)
     _read_box(cls)
     nx = len(cls.X)

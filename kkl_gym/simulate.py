@@ -170,8 +170,8 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
     """Return the next state by substeps whose length follows the error, or ``end`` if x escapes or turns NaN."""
-    # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: where equal
-    # substeps are too long for the interval's end, their error alone may carry x out of the bounds.
+    # Motions that accelerate, as at an ignition, need such substeps. The substeps also verify an escape: if equal
+    # substeps were too long at the end of the interval, their error alone may have carried x out of the bounds.
     if system.discrete:
         return end
     left, h, field, d = dt, dt, *forced(system, u, w)

@@ -11,7 +11,7 @@ from observers.machine import available
 
 
 class Decoders:
-    """T_inv for the n entries ``outputs`` of the estimate. Rows without input since reset use any ``free_inverse``."""
+    """T_inv for n entries ``outputs`` of the estimate; ``free_inverse``, if any, in rows without input since reset."""
 
     def __init__(self, artifact: Artifact, outputs: slice, **options: Any) -> None:
         free = artifact.free_inverse

@@ -45,8 +45,8 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary file to write, which replaces ``path`` once it is complete and on disk.
 
     The temporary file is in the same folder, which is created if missing. It has the permissions that the umask
-    allows, and the suffix of ``path``, from which some writers choose a format. After an exception it is deleted, and
-    ``path`` is unchanged. If the process is killed, :func:`training.files.clear_unfinished` removes the temporary file.
+    allows, and the suffix of ``path``, from which some writers choose a format. After an exception, it is deleted and
+    ``path`` is unchanged. A killed process leaves it behind; :func:`training.files.clear_unfinished` removes it.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")

@@ -6,7 +6,7 @@ figure and animation is written twice, as NAME and NAME-dark; docs/site/hooks.py
 ``python -m examples.research.figures figures/portraits.gif`` draws a single figure.
 
 docs/figures/qube.png is not drawn here and has only a light version: it needs a training (examples/qube.py) and records
-that are not part of this project. docs/figures/kkl.svg is drawn by hand; every call writes kkl-dark.svg from it.
+that are not part of this project. docs/figures/kkl.svg is drawn by hand; each run writes kkl-dark.svg from it.
 """
 
 import sys
@@ -171,7 +171,7 @@ def noise_levels() -> Draw:
 def errors_of_runs(
     level: float, *, trajectories: int = 100, duration: float | None = None
 ) -> dict[str, list[np.ndarray]]:
-    """Return, by system, errors in %, (steps, n), of the default map and of an EKF in runs of ``kkl-gym evaluate``.
+    """Return errors in % by system, (steps, n) for the default map and for an EKF, in runs of ``kkl-gym evaluate``.
 
     The runs start in X. The mean of a run's errors is its SMAPE; the tables of the pages show medians of SMAPEs.
     """

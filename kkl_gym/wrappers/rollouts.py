@@ -75,7 +75,7 @@ class NamedEstimator(KKLEstimator):
         return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the observations in a report: y, held where missing, then x_hat and any standard deviations, or z."""
+        """Return a report's observations: y or its last value, then either z or x_hat with any standard deviations."""
         y = report["y"]
         # A report of some rows has fewer rows than _held, but its y holds no NaN: it is of complete first samples.
         if np.isnan(y).any():

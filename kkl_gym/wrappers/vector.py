@@ -425,7 +425,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """Return the plant of row 0; ValueError if rows differ in system, dt, measurement noise or one of ``also``."""
+    """Return the plant of row 0; ValueError if rows differ in system, dt, measurement noise or attributes ``also``."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant

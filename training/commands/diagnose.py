@@ -62,7 +62,7 @@ class Diagnose:
             help=f"{SYSTEM} With --measured and --hidden: an environment as gym.make takes it, such as Pendulum-v1.",
         ),
     ] = None
-    measurement_noise: Annotated[NoiseLevels, hint("system: its own; else 1 and 10 % of y's standard deviation")] = None
+    measurement_noise: Annotated[NoiseLevels, hint("the system's; else 1 % and 10 % of y's standard deviation")] = None
     """Noise levels to check besides 0: standard deviations of y's noise. 0.1,0.3 gives a level for each output."""
     dt: Annotated[float | None, hint("the system's")] = None
     """Sampling interval of a system in seconds."""

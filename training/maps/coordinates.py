@@ -19,7 +19,7 @@ LEAST = 0.1  # the loss divides square errors by the mean square of x / scale pl
 class Coordinates:
     """Coordinates in which the covariance of given samples of z is the identity, and that of their noise diagonal.
 
-    A network in float32 cannot read z itself: components of z are nearly collinear: the variances along its principal
+    A network in float32 cannot read z itself: components of z are nearly collinear, and variances along its principal
     axes spread over ten orders of magnitude. ``noise_gain`` holds the noise's standard deviation in each coordinate.
 
     Shapes, for ``modes`` coordinates: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).
