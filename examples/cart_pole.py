@@ -67,7 +67,7 @@ def balance(x: np.ndarray) -> np.ndarray:
 
 
 def main(inverse_steps: int = 1500, trajectories: int = 500, out: Path = Path("runs/cart_pole")) -> np.ndarray:
-    """Train, then act on the estimate; returns its rms errors without the run's first fifth, in half-widths of X.
+    """Train, then act on the estimate; returns its rms errors after the run's first fifth, in half-widths of X.
 
     Args:
         inverse_steps: number of training batches.

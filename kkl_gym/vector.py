@@ -33,7 +33,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
     and states agree to rounding. ``info`` holds the same keys, as arrays with a row for each environment. For each key
     a mask ``_key`` marks the rows that reported it, as in Gymnasium's own vector environments.
 
-    **Autoreset modes.** ``"NextStep"``: the step after the end of a row's episode ignores its action and resets the
+    **Autoreset modes.** ``"NextStep"``: the step after a row's episode ends ignores the row's action and resets the
     row. ``"SameStep"``: the row is reset at once; ``info["final_obs"]`` and ``info["final_info"]`` hold the episode's
     last observation and info. ``"Disabled"``: a row stays at its episode's end, with reward 0 and its flags still set,
     until ``reset(options={"reset_mask": mask})``. While a row stays there, its ``u`` and ``escaped`` are not reported.

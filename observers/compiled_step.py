@@ -85,7 +85,7 @@ class CompiledStep:
 
 def _covariances(maps: tuple[Decoder, Decoder]) -> tuple[np.ndarray, np.ndarray]:
     """Return ages in seconds since reset, and the covariances of both decoders at these ages, (2, ages, nx^2)."""
-    errors = [each.error for each in maps if each.error is not None]  # both have one if the observer tracks
+    errors = [each.error for each in maps if each.error is not None]  # both have a covariance if the observer tracks
     ages = np.unique([age for error in errors for age in error.ages])
     return ages, np.array([error(ages, ages.shape).reshape(len(ages), -1) for error in errors])
 

@@ -56,7 +56,7 @@ class RecordEstimates:
     ) -> np.ndarray:
         """Return the error covariances (steps, ..., nx, nx) of :meth:`estimate`: :attr:`covariance` at each sample.
 
-        ``y``, ``u``, ``x0``, errors: as in :meth:`estimate`. Raises ArtifactError, too, if the map has no covariance.
+        Arguments and errors are as in :meth:`estimate`. Also raises ArtifactError if the map has no covariance.
         """
         self.artifact.require_covariance()
         return self._along(y, u, x0, of=self._kkl.covariance)

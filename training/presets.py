@@ -152,7 +152,7 @@ def preset(
 
     Maps that ship were trained with "fast", which takes about half a minute of CPU time, ten minutes for the size
     "large", and five for spinn. "paper" takes its sizes from the paper's sec. 8, which does not state the batch (here
-    4,096), the spacing of the eigenvalues (even for spinn) or the decay of the learning rate (here a cosine).
+    4,096), the spacing of the eigenvalues (here even, for spinn) or the decay of the learning rate (here a cosine).
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ class History(VectorWrapper):
     """Shows the state s of linear filters; action u and next observation y turn s into ``keep`` s + ``take`` [y, u].
 
     At an episode's start each filter holds the first observation and a zero action; without ``actions``, u is left out.
-    Autoreset mode: SAME_STEP. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
+    Needs autoreset mode SAME_STEP. Shapes: ``keep`` (k, k), ``take`` (k,); observations (n, k * (ny + nu)), float32.
     """
 
     def __init__(self, env: VectorEnv, keep: np.ndarray, take: np.ndarray, *, actions: bool = True) -> None:

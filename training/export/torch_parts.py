@@ -12,7 +12,7 @@ from observers.expression import Expression
 from observers.network import MLP
 from training.maps.networks import from_mlp
 
-LEAST_PIVOT = 1e-30  # lower bound of a Cholesky factorisation's pivots, which are variances; it divides by their roots
+LEAST_PIVOT = 1e-30  # lower bound of the pivots (variances) by whose roots a Cholesky factorisation divides
 
 
 def _of_tensors(function: Callable[..., Tensor]) -> Callable[..., Tensor]:

@@ -122,7 +122,7 @@ class TorchTracker(Module):
     def _relinearised(
         self, x: Tensor, P: Tensor, prediction: Prediction, new: Tensor, y: Tensor, u: Tensor, Q: Tensor, R: Tensor
     ) -> Prediction:
-        """In the rows ``new``, predict again: linearise motion about the previous state, smoothed by the new sample."""
+        """In rows ``new``, predict again: linearise the motion about the previous state as smoothed by the sample."""
         nx, (mean, S, across, sound) = self.nx, prediction
         V, white, _, known = self._corrected(mean, S, y, R)
         rows, solvable = eliminated(S, across, V.transpose(0, 1))

@@ -52,7 +52,7 @@ def identify(
     """Identify parameters of a plant from records of its outputs, and train an observer for it.
 
     No recorded state is needed. :func:`training.identification.identify.estimate_parameters` fits the parameters. The
-    observer is trained on simulated motions of the identified plant, for noise up to at least twice the records'.
+    observer is trained on simulated motions of the identified plant, with noise up to at least twice the recorded one.
 
     Parameters
     ----------

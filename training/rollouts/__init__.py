@@ -59,7 +59,7 @@ def learn(
     -------
     Artifact
         The observer. It tracks if each measured signal is a hidden signal, or a weighted sum of hidden signals.
-        ``training["held_out_errors"]`` are its errors on held-out episodes, or on the ends of fewer than five episodes.
+        ``training["held_out_errors"]`` are its errors on held-out episodes; of fewer than five, the ends are held out.
 
     Raises
     ------

@@ -23,7 +23,7 @@ LEAD_IN_SHARE = 0.4  # in this share of the motions without inputs, earlier inpu
 BEYOND = 2.0  # size, relative to X, of the box in which a third of the calibration runs start
 # Random inputs drive half of the calibration runs. A policy, if given, drives all, and explores in half of them.
 SOUND: dict[str, Any] = {"kinds": ("steps", "zero", "sine", "zero", "pulses", "zero"), "far": 1 / 3, "own": 2}
-LEAST_NOISE = 0.001  # a tracker's least measurement noise, as a share of the system's (or, if 0, of 5 % of y's range)
+LEAST_NOISE = 0.001  # least measurement noise of a tracker, relative to the system's (if 0, to 5 % of y's range)
 LEAST_PROCESS_NOISE = 0.005  # a tracker's least process noise, in System.scale per System.pace; a tenth of the default
 WINDOW, RUN = 0.5, 20.0  # durations of a tracker's window and of a calibration run, in multiples of System.pace
 SUBSTEPS = 64  # largest number of Runge-Kutta steps in a sampling interval

@@ -8,7 +8,7 @@ import scipy
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scale scores so that ``idle``, an idle agent's, is 0, and ``top``, full-state agents' interquartile mean, 1."""
+    """Scale scores so that ``idle`` (an idle agent's score) is 0 and ``top`` (of agents on the full state) is 1."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
@@ -33,7 +33,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3 or np.isnan(score):
         return score, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    with warnings.catch_warnings():  # an interval is NaN if a resample of ``best`` has a mean <= ``idle``
+    with warnings.catch_warnings():  # an interval is NaN if a resample of ``best`` has an interquartile mean <= idle
         warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
         resampled = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
     ends = resampled.confidence_interval
