@@ -13,7 +13,7 @@ DT = 0.01  # s
 
 
 def main(runs: int = 200, measurement_noise: float = 0.0, bias: float = 1.0, seed: int = 0) -> dict[str, list[float]]:
-    """Print the medians over runs of errors and mismatches of each system's SPINN observer; returns them by system.
+    """Print median errors and mismatches, over all runs, of each system's SPINN observer; returns them by system.
 
     The errors are |x_hat - x| / |x|, taken 0, 0.5 and 2 s after a start in X: for known x0, then for unknown x0.
     ``observer.mismatch`` is taken after 20 s, in runs without a fault and in the same runs with a sensor that is

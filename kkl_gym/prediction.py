@@ -18,8 +18,8 @@ class PredictiveMemory(Memory):
     """A memory that returns the outputs expected in the next step, and predictions of later ones.
 
     It filters all outputs and angles, also the angles' cosines and sines, on which a torque may depend. ``weights``
-    (features, width) multiply outputs, angles, their filters w, the inputs' filters v, and 1. The first columns give
-    expected changes in a step, of outputs except cosines and sines, and of angles; the others give further predictions.
+    (features, width) multiply outputs, angles, their filters w, the inputs' filters v, and 1. Its first columns give
+    expected changes in one step, of angles and of outputs other than cosines and sines; the others, later predictions.
     """
 
     def __init__(

@@ -95,7 +95,7 @@ class ErrorCovariance:
         return type(self)(np.zeros(1), self.ages, interpolated(level, self.levels, self.covariance)[None])
 
     def __call__(self, age: np.ndarray | float, shape: tuple[int, ...] = ()) -> np.ndarray:
-        """Return covariances (..., nx, nx) at ages, broadcast to ``shape`` if given; call :meth:`at_level` before."""
+        """Return covariances (..., nx, nx) at ages for the level given to at_level, broadcast to ``shape`` if given."""
         return interpolated(np.broadcast_to(age, shape or np.shape(age)), self.ages, self.covariance[0])
 
 

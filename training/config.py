@@ -98,7 +98,7 @@ class Config:
     """Whether an input-aware map has a second inverse T_inv(z_y), used until an input acts; none with a policy."""
     lead_in_input: NotNegative = 0.0
     """Some trajectories without inputs start where earlier inputs have led, mostly outside X. These inputs are constant
-    over 20 paces, up to this multiple of their bounds; with 0, random over 10 paces."""
+    over 20 paces, up to this multiple of their bounds; with 0, random within bounds over 10 paces."""
     process_noise_share: Share = 0.35
     """Share of trajectories with process noise (input-aware); with 0, its level is not an input of T_inv."""
     measurement_noise_max: Levels = 1.0
@@ -131,7 +131,7 @@ class Config:
     """Parameters of the system that differ from motion to motion (input-aware), by name, with their largest relative
     deviations; "all" stands for each that is not named. Some motions keep the system's own values."""
     bias: Biases = 0.0
-    """Largest constant bias (one, or one per output); T_inv estimates biases (input-aware, without ``uncertain``)."""
+    """Largest constant bias of all outputs, or of each; T_inv estimates biases (input-aware, without ``uncertain``)."""
     estimate_parameters: bool = False
     """Whether T_inv estimates the uncertain parameters, too."""
     cpu_seconds: Positive | None = None

@@ -76,7 +76,7 @@ def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterat
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a folder, write a run's configuration; ValueError if it holds checkpoints (``resume``: another run's)."""
+    """Lock a run's folder and write its configuration; ValueError at checkpoints, with ``resume`` at another run's."""
     with locked(folder):
         if not resume:
             refuse_checkpoints(folder)

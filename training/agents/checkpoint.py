@@ -28,7 +28,7 @@ class Checkpoint(BaseCallback):
     A checkpoint holds networks, optimisers, counters, the scaling of observations and rewards, the replay buffer, the
     learning curve, KKLMemory's weights and the recorded samples that train an observer. It holds neither environments
     nor random generators: a resumed training begins new episodes with other random numbers. The learning curve has a
-    row for each episode: the training's steps and CPU seconds at its end, and its return.
+    row for each episode: the training's steps and CPU seconds at the episode's end, and its return.
     """
 
     def __init__(self, path: Path, fingerprint: str, *, resume: bool) -> None:

@@ -162,7 +162,7 @@ def output_deviation(system: System) -> Feature:
 
 
 def _modes(env: VectorEnv, artifact: Artifact, system: System | None) -> VectorEnv:
-    """Show z as T_inv takes it, but relative to z at a system's target; y without a system; age if T_inv takes it."""
+    """Show z as T_inv takes it, minus z at a system's target; without a system, z and y. Add age if T_inv takes it."""
     inverse, linear, inside = artifact.inverse, artifact.filter, env
     while not isinstance(inside, KKLVectorObservation):
         inside = inside.env  # type: ignore[attr-defined]

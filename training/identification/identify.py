@@ -15,8 +15,8 @@ from training.identification.windows import LEAST_USED, MORE_COST, Prediction, f
 from training.progress import ProgressBars
 from training.records import Record, check_signals, pieces
 
-HELD_OUT = 10  # of the long enough pieces of records between gaps, the 6th, 16th, 26th, ... are held out of the fit
-KEPT_RATIOS = 100.0  # prior variance of log(factor common to all parameters) / that of log(factor of each parameter)
+HELD_OUT = 10  # of the sufficiently long pieces of records between gaps, the 6th, 16th, 26th, ... are held out
+KEPT_RATIOS = 100.0  # prior variance of log(common factor of all parameters), over that of log(each one's own factor)
 BACK = (1.0, 0.5, 0.25)  # shares of the way to nearest(...), tried until one leaves the fit about as good
 UNSCALED = 0.05  # a state's scale is unidentifiable if its relative change exceeds this share of the parameters' change
 SIMULATED = 1e-7  # relative error of the simulation, a lower bound of relative standard errors
@@ -134,7 +134,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     """Return the parameters nearest to ``given`` among all that explain the outputs as well as ``values`` do.
 
     Parameters without influence on the outputs become ``given``; those of another sign than ``given`` keep ``values``.
-    For the rest, the distance heavily weights changed ratios, and lightly weights a common factor (a faster plant).
+    For the rest, the distance weighs changed ratios heavily, and a common factor, as of a faster plant, lightly.
 
     Shapes: ``values`` (p,), ``given`` (p,), unidentifiable directions ``hidden`` (p, k); returns (p,).
     """

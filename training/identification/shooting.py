@@ -109,8 +109,8 @@ class Fit:
 def predictable(fit: Fit, windows: Windows) -> np.ndarray:
     """Return a mask (n,) of the windows whose outputs respond linearly to parameter changes of one standard error.
 
-    A change is at most one unit. Long windows of a chaotic motion do not respond linearly: their squared residuals
-    have many minima, and the curvature at a minimum gives no standard errors.
+    Changes are cut to one ``Shooting.unit`` where standard errors are larger. Long windows of a chaotic motion do not
+    respond linearly: their squared residuals have many minima, and the curvature at a minimum gives no standard errors.
     """
     shooting, theta, problem = fit.shooting, fit.theta, Problem(fit.shooting, windows)
     at = problem.settled(theta)

@@ -169,7 +169,7 @@ class TrajectorySampler(Sampler):
         )
 
     def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw positions, 0 to 1, in the two decades of noise levels; return them and levels, (ages, ny, samples)."""
+        """Draw noise levels over two decades; return positions in these, 0 to 1, and levels (ages, ny, samples)."""
         shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
         quiet = self._config.noise_free_share
         position = (torch.rand(shape, generator=generator, device=generator.device) - quiet) / (1 - quiet)

@@ -21,7 +21,7 @@ from training.spectrum import FASTEST_MODE, Spectrum, evenly_spaced
 from training.trajectories.motions import recording_ages
 
 FEW = 5  # with this many records or more, whole records are held out; with fewer, the end of each
-STRETCHES, SAMPLES = 600, 2_000_000  # calibration: most stretches, and most samples (100 stretches may have more)
+STRETCHES, SAMPLES = 600, 2_000_000  # largest numbers for calibration; 100 stretches of records may have more samples
 STRETCH_MEMORIES = 2.0  # greatest length of a stretch, in settling times of the filter
 FEWEST = 50  # calibration needs at least this many samples at which a stretch may begin
 BEYOND = 0.5  # a tracker's estimates may leave the range of each recorded state by this fraction of the range

@@ -10,8 +10,8 @@ from kkl_gym.system import Box, Components, System
 from observers.checks import shown
 from training.trajectories.motions import Controller
 
-# With k uncertain parameters, a share NOMINAL_SHARE ** k of the training motions has the system's own values, and
-# the other motions have other values. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6 and layers
+# With k uncertain parameters, a share NOMINAL_SHARE ** k of the training motions has the system's own values of all k,
+# and the other motions have other values. NOMINAL_SHARE was chosen on the four systems that ship: with 0.6 and layers
 # of 256 units, the map of lorenz no longer distinguished a plant with the system's own parameters from others.
 NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of an additional state: hardly any process noise acts on it, and 0 would be invalid
@@ -132,7 +132,7 @@ def _with_constants(
             return outputs(x)
 
         def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])  # not with arrays as parameters, which a user's formula may refuse
+            return system.rate(x[:nx])  # with the system's own parameters: users' formulas may refuse arrays
 
         if system.discrete:
 

@@ -43,7 +43,7 @@ def collect(out: Path, beside: Path | None = None) -> None:
                 }
             )
     if len(benchmarks := {(cost["budget"], cost["seed"]) for cost in costs}) > 1:
-        raise ValueError(f"{out} holds jobs of several pairs (budget, seed), {sorted(benchmarks)}; keep one of them")
+        raise ValueError(f"{out} holds jobs of several pairs (budget, seed), {sorted(benchmarks)}; keep jobs of one")
     for name, frame in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
         rows = _as_written(StringIO(frame.to_csv(index=False, float_format="%.4g")))
         if beside is not None:
@@ -70,7 +70,7 @@ def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
 
 
 def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
-    """Return what must agree: budgets and seeds of methods.csv, or, in results.csv, the test cases of ``systems``."""
+    """Return what joined files must share: budget and seed (methods.csv), or cases of ``systems`` (results.csv)."""
     if "budget" in frame:
         return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
     cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()

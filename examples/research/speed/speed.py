@@ -81,7 +81,7 @@ class Speed:
         return ratios
 
     def _environments(self, envs: Mapping[str, Any], steps: int, progress: ProgressBars) -> dict[str, float]:
-        """Measure the environments' times of a step; the first environment is the reference."""
+        """Measure each environment's time per step; the first environment is the reference."""
         tasks = {}
         for name, env in envs.items():
             env.action_space.seed(0)
@@ -102,7 +102,7 @@ class Speed:
         counts: Mapping[int, int],
         progress: ProgressBars,
     ) -> None:
-        """Measure times of observers and filters alone; ``counts`` maps a number of rows to the samples of each row."""
+        """Time observers and filters without environments; ``counts`` maps numbers of rows to samples per row."""
         lines = []
         for name, system in systems.items():
             artifact = Artifact.read(resolve(name))
