@@ -32,12 +32,12 @@ WRONG = 1.1  # ratio of the plant's parameters to those of the observer's model
 
 @dataclass(frozen=True)
 class Compared:
-    """SMAPE in % over all steps of a trajectory; its median over unseen trajectories of the plant.
+    """Errors of three observers on the plant, and of the parameters that were identified.
 
     Parameters
     ----------
     shipped, adapted, trained : float
-        Errors of the shipped observer, the adapted one, and the one trained on the true parameters.
+        SMAPE in % over all steps, as the median over unseen trajectories; ``trained`` had the true parameters.
     parameters : dict of str to float
         Errors of the identified parameters, in % of the plant's parameters.
     """

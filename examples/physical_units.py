@@ -60,7 +60,7 @@ class StirredTank(System):
 
 @dataclass(frozen=True)
 class HeatedTank(System):
-    """A heated tank of flowing water, 4.18e6 J/(m^3 K); its temperature is measured, its level is not. SI units.
+    """A heated tank with a flow of water (4.18e6 J/K per m^3); its temperature is measured, not the level. SI units.
 
     level' = (inflow - outlet sqrt(level)) / area, T' = (inflow (T_in - T) + (power + u) / 4.18e6) / (area level).
     """

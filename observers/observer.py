@@ -191,7 +191,7 @@ class KKLObserver(RecordEstimates):
 
     @property
     def z(self) -> np.ndarray:
-        """State [z_y, z_u] of the filters of y and of u, a copy (..., nz * (1 + nu)); RuntimeError before reset."""
+        """The filter's state [z_y, z_u], driven by y and by u: a copy (..., nz (1 + nu)). RuntimeError before reset."""
         state = self._begun()
         return state[:, self._kkl.z].reshape(*self._batch, self.artifact.filter.size).copy()
 

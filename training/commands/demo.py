@@ -24,7 +24,7 @@ from training.files import require_writable
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports of progress
-SECONDS = 12.0  # s, length of an animation; it shows SECONDS times System.pace, so in real time where the pace is 1 s
+SECONDS = 12.0  # s, length of an animation; it shows 12 times System.pace: real time if the pace is 1 s
 FRAMES = 144  # number of frames in an animation
 TRAIL = 0.35  # share of the samples that a frame's phase portrait draws; older points would hide the latest
 

@@ -20,7 +20,7 @@ MIN_STEPS = 10  # least number of samples of a motion
 UNSEEN, HARDLY = 0.9, 0.3
 INVOLVED = 0.3  # a finding names a state if its component of the direction, a unit vector, is larger
 VAGUE, NOTHING = 0.3, 1.0  # errors in standard deviations of the state, without and with noise, that get a "note"
-# A symmetry: a state's least error is <= LOCALLY, but >= GLOBALLY if similar y predict it (in standard deviations).
+# Under a symmetry, least errors (in standard deviations) are <= LOCALLY, but predictions from y err by >= GLOBALLY.
 LOCALLY, GLOBALLY = 0.1, 0.3
 WINDOWS, MAX_SAMPLES = 7, 100  # number of windows, each half as long as the one before; upper bound of samples in each
 

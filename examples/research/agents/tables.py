@@ -90,7 +90,7 @@ def _task_name(environment: str, noise: float | str) -> str:
 
 
 def in_tasks(results: "pd.DataFrame") -> "pd.DataFrame":
-    """Add columns: task, idle (idle agent's return). In environments noise levels share full-state and idle agents."""
+    """Add columns task and idle (return). In environments, all noise levels share full-state and idle agents."""
     import pandas as pd
 
     tasks = []

@@ -92,7 +92,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     costs = methods.set_index(["system", "method"])
     lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "The best on validation runs, where a method has several configurations.", ""]
+    lines += ["## Configuration", "", "Each method's best on validation runs; with --quick, its first.", ""]
     lines += _by_method(methods, partial(_configuration, costs))
     write(path, "\n".join(lines) + "\n")
 

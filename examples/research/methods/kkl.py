@@ -72,8 +72,8 @@ def trained(task: Task, config: Config) -> Artifact:
 class Default(KKLMethod):
     """The package's method (``kkl-gym train``): T_inv takes filtered y and u, the noise level and the age.
 
-    For each of its two T_inv it simulates as many trajectories as every other method has, and adds noise: driven
-    motions for one, free motions for the other. Some free motions start at states that inputs have reached from X.
+    One T_inv is trained on driven motions, one on free motions, both with noise. Each has as many simulated
+    trajectories as every other method. Some free motions start at states that inputs have reached from X.
     Each T_inv has half of the time, although the benchmark uses only the one for free motions. The only configuration
     is the preset, which was chosen during the package's development.
     """
