@@ -76,7 +76,7 @@ def main(
     """Train the agents; returns, for each way of training, the larger of the hidden signals' two relative errors.
 
     Args:
-        observer_steps: steps from which an observer is first learned: random ones, in the third way a trained agent's.
+        observer_steps: steps from which an observer is first learned: random ones, or in the third way an agent's.
         members: number of networks of this first observer; their outputs are averaged.
         timesteps: further steps, in which the agents learn.
         every: steps between refits; also the number of last steps, in which the third agent learns on estimates.

@@ -151,7 +151,7 @@ def motion(expression: Expression, nx: int, nu: int, W: int, discrete: bool) -> 
 
 @functools.cache
 def output(expression: Expression, nx: int, W: int) -> Any:
-    """Compile h(x): outputs (ny, points, W) are written at sigma points (nx, points, W), for W rows of the batch."""
+    """Compile h(x) to a function that writes outputs (ny, points, W) at sigma points (nx, points, W), for W rows."""
     wide, ny = (2 * nx + 1) * W, len(expression.components)
     function = expression.python("function", nx, 0)
     given = ", ".join(f"s[{i * wide} + p]" for i in range(nx))

@@ -97,7 +97,7 @@ def part(**options: Any) -> Callable[[_F], _F]:
 
 
 def _named(function: _F, options: dict[str, Any]) -> _F:
-    """Add a hash to a function's name: the hash of its content and of the functions that it calls.
+    """Add to a function's name a hash of the function's content and of the functions that it calls.
 
     Numba links machine code of several processes by name, so different functions need different names. They then have
     different files, too, which matters because two processes may write at once.

@@ -25,7 +25,7 @@ KNOWN = 1e-3  # assumed standard deviation of a known initial state, in multiple
 
 @dataclass(frozen=True)
 class Supervision:
-    """Limits of the innovations' running statistics, valid at any noise level; a sample's share in each statistic."""
+    """Limits of the innovations' running statistics, valid at any noise level, and a new sample's share in each."""
 
     window: int
     share: float

@@ -39,7 +39,7 @@ class ProgressBars(Progress):
 
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
-        """Show a phase, complete after the ``with`` block, removed by an error; yield a function to report progress."""
+        """Show a phase: the ``with`` block completes it, an error removes it. Yield a function to report progress."""
         task = self.add_task(description, total=total)
         try:
             yield lambda done: self.update(task, completed=done)

@@ -133,7 +133,7 @@ class Train:
     observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
     """For environments without --observer: number of steps at the start, from which an observer is learned. Without
     noise the agent also learns in them, from true hidden signals; only their last 100,000 serve the observer. With
-    noise actions are random. For --information z with noise: random steps, from which KKLMemory learns to predict."""
+    noise, actions are random. For --information z with noise: random steps, from which KKLMemory learns to predict."""
     aggregate: int = 0
     """Number of refits of the observer to the agent's own steps while the agent learns from estimates. With refits,
     the agent neither learns nor explores in the last twentieth of all steps, and a last refit follows."""

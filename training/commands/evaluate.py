@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # transient of driven runs, in units of System.pace; at most half of a run
 FIRST, SETTLED = 2.0, 5.0  # error bars are evaluated before FIRST and after SETTLED, in units of System.pace
-SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, in multiples of a map's largest in training
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # noise levels for error bars, as shares of the largest in a map's training
 FAULTS_HEADER = ("false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %")
 
 
@@ -122,8 +122,8 @@ class Evaluate:
     fifth of a run. In driven runs (by random steps and sines) it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
-    beyond a map's range are left out. A policy under which an observer was trained gives the inputs of all runs.
-    In those called driven it explores, and sees the state with errors; in the others it sees the exact state.
+    beyond a map's range are left out. A policy under which an observer was trained gives all runs' inputs. In those
+    called driven it explores, and sees the state with errors; in the others it sees the exact state, which u reveals.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.

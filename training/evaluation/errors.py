@@ -198,7 +198,7 @@ def errors(
 def noise_limit(
     system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int, skip: float | None = None
 ) -> Errors:
-    """Return errors at the posterior Cramér-Rao bound, below which no unbiased causal estimator stays.
+    """Return errors at the posterior Cramér-Rao bound, which no unbiased causal estimator can beat.
 
     The errors are drawn from N(0, P), where P is the bound along each trajectory. The bound follows from the plant's
     exact equations, its inputs, both noise levels, and the covariance of the starts in X. A biased estimator, such as
@@ -264,7 +264,7 @@ def measured(system: System, trajectories: UnseenTrajectories, measurement_noise
 def parameter_errors(
     artifact: Artifact, system: System, trajectories: UnseenTrajectories, *, measurement_noise: Level, seed: int
 ) -> np.ndarray:
-    """Return parameters' rms relative errors in % after the transient; without a plant, x ends with the true ones."""
+    """Return parameters' rms errors in % after the transient; without a plant, the last states in x are the truth."""
     names, (_, n, nx) = artifact.estimated_parameters, trajectories.x.shape
     if not n:
         raise ValueError(f"all {trajectories.escaped} runs left bounds = {system.bounds}")

@@ -178,7 +178,7 @@ class TorchObserver(Module):
         return torch.minimum(level, self.driven.measurement_noise_max), process_level
 
     def _of_map(self, z: Tensor, method: Callable[..., Tensor], *arguments: Tensor) -> Tensor:
-        """Call ``method`` of ``free``, T_inv for free motions, in rows without input so far, else of ``driven``."""
+        """Call ``method`` of the map ``free`` in rows without an input so far, of the map ``driven`` in the others."""
         driven = method(self.driven, z, *arguments)
         if self.free is None:
             return driven

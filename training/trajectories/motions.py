@@ -27,7 +27,7 @@ RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
 FAR = 0.6  # share of the trajectories that start in the larger box, if there is one
 INPUT_WEIGHT = 0.1  # a regulator's weight on inputs, relative to that on states, both scaled by typical sizes
 POLICY_KINDS = ("steps", "sine")  # signals of a policy's errors and of its exploration
-POLICY_ERROR = (0.02, 0.5)  # range of a motion's bound of errors in the state that a policy sees, in System.scale
+POLICY_ERROR = (0.02, 0.5)  # range of the bound, drawn per motion, of errors in states a policy sees, in System.scale
 EXPLORATION = 0.5  # largest amplitude of the signal added to a policy's actions, in multiples of input bounds
 # One in this many trajectories follows the policy exactly. The exact policy's input reveals the state; an agent's
 # input, which depends on x_hat, does not. If a regulator acts on x_hat, at the default noise, the error of cart-pole's

@@ -16,7 +16,7 @@ from training.evaluation.levels import Level, as_cell, multiple
 from training.evaluation.metrics import by_state, nrmse, smape
 from training.seeds import Stream, generator
 
-UNTIMED, TIMED = 100, 400  # samples in a round of step_time: first untimed ones, for convergence, then at most TIMED
+UNTIMED, TIMED = 100, 400  # samples in a round of step_time: first UNTIMED, for convergence, then at most TIMED
 LOST = 50.0  # a trajectory with a larger SMAPE in % after the transient counts as lost
 
 
@@ -107,7 +107,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """Return the mean CPU time in µs of a batch step after the transient, in the fastest of five rounds from X."""
+    """Return the CPU time in µs of a batch's step after the transient: the mean in the fastest of five rounds."""
     observer = Running(method.observer(trained, system, dt, system.measurement_noise))
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))
