@@ -73,7 +73,7 @@ class KKLObserver(RecordEstimates):
         If ``compiled`` is True and Numba is not installed.
     ValueError
         If an argument has the wrong type or is out of range, the levels of measurement noise differ between outputs
-        but the map takes one level for all, or an argument needs a motion model or limits that the artifact lacks.
+        but the map takes one level for all, or the map lacks the motion model or the monitor's limits for an option.
     """
 
     def __init__(

@@ -109,6 +109,6 @@ def run_missing(
 
 
 def check_failures(failures: Sequence[str], jobs: Sequence[Job], what: str) -> None:
-    """Raise ValueError with the first failure, if there are any."""
+    """Raise ValueError with the first failure if any job failed."""
     if failures:
         raise ValueError(f"{len(failures)} of {len(jobs)} {what} failed; the first: {failures[0]}")

@@ -102,9 +102,9 @@ def learn(
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. By default the first steps are then fewer. Their actions are random, and only the observer learns.
 
-    If ``observer_steps`` is given for z under noise, KKLMemory's weights are learned from that many random steps.
-    All these first steps count as steps of the training. The observer is refitted ``aggregate`` times to the agent's
-    own steps and, if this number is not 0, once more at the end.
+    If an agent sees z under noise and ``observer_steps`` is given, kkl_gym.KKLMemory.learn_weights gets that many steps
+    with random actions. All these first steps count as steps of the training. The observer is refitted ``aggregate``
+    times to the agent's own steps and, if this number is not 0, once more at the end.
 
     A resumed training starts new episodes, so its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
@@ -200,7 +200,7 @@ def learn(
 
 
 def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
-    """Return the number of first steps, from which an observer or KKLMemory's weights are learned."""
+    """Return the number of first steps, from which an observer or the weights of z are learned."""
     first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
     if 0 < first < steps - rehearsal:
         return first

@@ -81,7 +81,7 @@ class TaskOptions:
 
     measured: Measured = ()
     """Entries of the flattened observation that agents may see, as in 0,1. In systems, y is measured."""
-    hidden: Annotated[tuple[int, ...], _INDICES, hint("all others")] = ()
+    hidden: Annotated[tuple[int, ...], _INDICES, hint("all others, but no constraint force")] = ()
     """Entries of the flattened observation that an observer estimates."""
     env_kwargs: EnvironmentArguments = ()
     time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
@@ -130,10 +130,11 @@ class Train:
         hint("ppo_lstm for recurrent; sac for reverse_duffing, Pendulum-v1, MountainCarContinuous-v0; else ppo"),
     ] = None
     """The algorithm of stable-baselines3. Recurrent agents need ppo_lstm."""
-    observer_steps: Annotated[int | None, hint("nine tenths of all steps, or one tenth with noise")] = None
+    observer_steps: Annotated[int | None, hint("nine tenths of all steps; with noise one tenth; z: none")] = None
     """For environments without --observer: number of steps at the start, from which an observer is learned. Without
-    noise the agent also learns in them, from true hidden signals; only their last 100,000 serve the observer. With
-    noise, actions are random. For --information z with noise: random steps, from which KKLMemory learns to predict."""
+    noise the agent also learns in them, from true hidden signals; only the last 100,000 of these steps serve the
+    observer. With noise the actions in them are random. For --information z with noise: number of steps with random
+    actions at the start, from which the memory learns weights, so that z predicts the next outputs."""
     aggregate: int = 0
     """Number of refits of the observer to the agent's own steps while the agent learns from estimates. With refits,
     the agent neither learns nor explores in the last twentieth of all steps, and a last refit follows."""

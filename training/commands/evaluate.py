@@ -122,8 +122,9 @@ class Evaluate:
     fifth of a run. In driven runs (by random steps and sines) it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
-    beyond a map's range are left out. A policy under which an observer was trained gives all runs' inputs. In those
-    called driven it explores, and sees the state with errors; in the others it sees the exact state, which u reveals.
+    beyond a map's range are left out. A policy under which an observer was trained gives the inputs of all runs. In
+    the runs that the tables call driven, the policy explores, and sees the state with errors. In the other runs it sees
+    the exact state, so that its inputs tell the observer more about the state than the outputs do.
 
     --calibration: the shares of errors within the 50, 90 and 99 % regions of the covariances, for all states together
     and for each, and the mean normalised estimation error squared (NEES), at six noise levels.

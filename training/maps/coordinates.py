@@ -93,7 +93,7 @@ def root(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class StateScale:
-    """Scales states by an offset and a scale, (n,) each; the first ``nx`` states (None: all) set errors' weights."""
+    """Scales states by an offset and a scale, (n,) each; :meth:`weight` reads the first ``nx`` states (None: all)."""
 
     offset: np.ndarray
     scale: np.ndarray
