@@ -102,9 +102,9 @@ def learn(
     and afterwards their estimates. Under noise the estimates are less accurate, and a policy for true signals does not
     suit them. By default the first steps are then fewer. Their actions are random, and only the observer learns.
 
-    If an agent sees z under noise and ``observer_steps`` is given, kkl_gym.KKLMemory.learn_weights gets that many steps
-    with random actions. All these first steps count as steps of the training. The observer is refitted ``aggregate``
-    times to the agent's own steps and, if this number is not 0, once more at the end.
+    If the agent sees z under noise and ``observer_steps`` is given, z learns to predict outputs from so many steps with
+    random actions (:meth:`kkl_gym.KKLMemory.learn_weights`). All first steps count as steps of the training. Refits of
+    the observer use the agent's own steps: ``aggregate`` refits and, if this is not 0, one more at the end.
 
     A resumed training starts new episodes, so its agent differs from that of an uninterrupted training.
     ``Agent.training`` then holds the number of resumptions.
@@ -183,14 +183,14 @@ def learn(
                 before = [] if privileged is None else privileged.records()
                 checkpoint.records = lambda: before
                 every = max(1, (left - (first - checkpoint.spent)) // (aggregate + 1))
-                callbacks.append(refits(task, every, rehearsal, folder / OBSERVER, before))
+                callbacks.append(refitting := refits(task, every, rehearsal, folder / OBSERVER, before))
             else:
                 checkpoint.records = list
             with bars.phase(description, left) as report:
                 learner.learn(left, [_Bar(report), *callbacks])
     model = learner.model
-    # The refits have saved the observer that the agent used last.
     if aggregate:
+        refitting.artifact.save(folder / OBSERVER)  # a given observer stays in use if no refit was possible
         observer = str(folder / OBSERVER)
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     training = {**how, "timesteps": model.num_timesteps + checkpoint.spent, **resumed}
@@ -200,7 +200,7 @@ def learn(
 
 
 def _first_steps(task: Task, steps: int, rehearsal: int, given: int | None) -> int:
-    """Return the number of first steps, from which an observer or the weights of z are learned."""
+    """Return the number of first steps, from which an observer or z's predictions of outputs are learned."""
     first = round((WANDERED if task.measurement_noise else PRIVILEGED) * steps) if given is None else given
     if 0 < first < steps - rehearsal:
         return first

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-RESOLUTION = 1e-3  # a network's error in reading its input z, even without noise, in standard deviations of z
+RESOLUTION = 1e-3  # networks are at best as accurate as if z had an error of so many standard deviations
 
 Verdict = Literal["ok", "note", "problem"]
 

@@ -145,7 +145,7 @@ def _table_of_systems(
 
     table = [[label, *(text(by_kind.get((task, kind))) for task in tasks)] for kind, label in labels.items()]
     minutes = results[results.shown != IDLE].groupby("shown").seconds.mean() / 60
-    spent = ", ".join(f"{label} {minutes[kind]:.1f}" for kind, label in labels.items() if kind in minutes)
+    spent = "; ".join(f"{label}: {minutes[kind]:.1f}" for kind, label in labels.items() if kind in minutes)
     return [
         "# Agents",
         "",

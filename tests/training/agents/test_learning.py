@@ -168,6 +168,10 @@ def test_short_episodes_are_no_error(tmp_path, small, task):
     agent = learn(task, "x_hat", tmp_path, **options)
     assert agent.observer == str(tmp_path / "observer.safetensors")
     assert agent.make().reset(seed=0)[0].shape == (1, 4)  # two positions, two estimates
+    options = {"observer": agent.observer, "algorithm": "dqn", "timesteps": 12, "aggregate": 1}
+    with pytest.warns(UserWarning, match="the observer in use stays"):
+        given = learn(task, "x_hat", tmp_path / "given", **options)
+    assert given.observer == str(tmp_path / "given" / "observer.safetensors")  # although no refit was possible
 
 
 def test_an_observer_is_refitted_to_the_agents_own_episodes(tmp_path, small, monkeypatch):
