@@ -273,13 +273,13 @@ def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, tru
         ("sees", agent.information),
         ("measurement noise", show_level(task.measurement_noise)),
         ("episodes", str(n)),
-        ("return", _mean(played.returns)),
+        ("return (sum of the environment's rewards)", _mean(played.returns)),
     ]
     system = None if task.system is None else get_system(task.system)
     if system is not None and not system.states_task:
         x = played.signals("x")
         rows += [
-            ("score", _mean(scores(system, x))),
+            ("score (mean of exp(-4 cost) - 1, at best 0)", _mean(scores(system, x))),
             (f"holds the target within {TOLERANCE:g}", f"{_mean(100.0 * successes(system, x))} %"),
             ("escaped", f"{100 * played.escaped.mean():.0f} %"),
         ]

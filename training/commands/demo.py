@@ -160,6 +160,7 @@ def table(episodes: Sequence[Episode]) -> Table:
         *("SPINN", "late") if with_spinn else (),
         "µs a step",
         title=f"SMAPE in %, all steps and late (after 20 %), measurement noise {noise}",
+        caption="SMAPE is relative to the state: near the state 0 it is large for every observer.",
     )
     for episode in episodes:
         estimates = [episode.x_hat, *([episode.spinn] if with_spinn else [])]

@@ -117,9 +117,11 @@ class Evaluate:
     """Evaluate observers on unseen trajectories: errors, coverage of error bars, or detection of faults.
 
     Trajectories start in X (the training box) and in 2X outside X, with and without noise. SMAPE, in percent, uses the
-    norm of the whole state, over all steps (the paper's measure) and after the transient. NRMSE is the root mean square
-    error of each state after the transient, in percent of the state's standard deviation. The transient is the first
-    fifth of a run. In driven runs (by random steps and sines) it is the first 5 s (500 samples for your own systems).
+    norm of the whole state, over all steps (the paper's measure) and after the transient. SMAPE is relative
+    to the state: near the state 0 it is large for every observer, as under noise in motions that come to rest there.
+    NRMSE is the root mean square error of each state after the transient, in percent of the state's standard deviation
+    over all steps of all trajectories. The transient is the first fifth of a run. In driven runs (by random
+    steps and sines) it is the first 5 s (500 samples for your own systems).
 
     2X is cut at the system's declared bounds. Trajectories that leave the bounds are counted and left out; noise levels
     beyond a map's range are left out. A policy under which an observer was trained gives the inputs of all runs. In

@@ -150,7 +150,7 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
     """Check whether batches and single environments run as machine code."""
     obstacle = subject.step.obstacle
     if importlib.util.find_spec("numba") is None:
-        yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
+        yield Finding("compiled", "note", "Numba is not installed: training is slower", 'pip install "kkl-gym[fast]"')
     elif subject.system.discrete:
         yield Finding("compiled", "ok", "nothing to compile: the system is not integrated")
     elif obstacle is not None:
