@@ -1,4 +1,4 @@
-"""The inverse T_inv: batches along motions or of z = T(x), and the loss of the network."""
+"""Training of T_inv: batches of (z, x), from motions or from z = T(x), and the network's loss."""
 
 import math
 from typing import Any, NamedTuple, Protocol
@@ -239,7 +239,7 @@ class InverseProblem(nn.Module):
         self._risk = compiled(self.risk, device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Draw a batch; return its loss and the geometric mean of all cells' running errors, see :meth:`risk`."""
+        """Draw a batch; return its loss and the geometric mean of the cells' running errors, see :meth:`risk`."""
         risk, error = self._risk(*self.sampler(generator))
         return {"loss": risk, "error": error}
 
@@ -251,7 +251,7 @@ class InverseProblem(nn.Module):
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # in separate cells, as parameters can be hard to estimate where states are easy
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # All plants share these cells, lest the map return the system's own parameters for similar plants.
+            # Separate cells would give small errors of nominal plants more weight: others would seem nominal, too.
             cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
