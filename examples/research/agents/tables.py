@@ -155,7 +155,7 @@ def _table_of_systems(
         "",
         *files.table(["", *tasks], table),
         "",
-        f"CPU minutes for one training. {spent}.",
+        f"CPU minutes for one training – {spent}.",
     ]
 
 
