@@ -13,7 +13,7 @@ from training.records import Record
 
 FIRST_LENGTHS = (100, 200, 400)  # lengths of the first windows in samples; each length is fitted in turn
 MORE_NOISE = 1.5  # largest standard deviation of the first windows' residuals, in multiples of the noise level
-SMALL = 0.01  # the same in multiples of the output's standard deviation; the larger of both limits counts
+SMALL = 0.01  # the same in multiples of the output's standard deviation; the larger of the two limits counts
 LEAST_USED = 0.8  # least share of the windows that the model must explain at a new length
 GAIN = 0.7  # lengths grow no further once every standard error is more than this share of its previous value
 MORE_COST = 2.0  # largest factor by which a doubling may increase the residuals' mean square
@@ -162,7 +162,7 @@ class Prediction:
 
 
 def predict(fit: Fit, records: Sequence[Record], rng: np.random.Generator) -> list[Prediction]:
-    """Predict outputs in the first window of each long enough record; the window's first half gives the start."""
+    """Predict outputs in the first window of each record that has one; the window's first half gives the start."""
     length, theta = len(fit.windows.u), fit.theta
     chosen = [record for record in records if len(record.y) > length]
     if not chosen:

@@ -49,11 +49,11 @@ PPO: dict[str, Any] = {
 CONTINUOUS = {"use_sde": True, "sde_sample_freq": 4}  # smooth exploration where actions are continuous
 LEARNING_RATE = 0.001  # at the start; it falls linearly to zero
 FRAMES = 32  # steps in the linear recurrent unit's history
-EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # intervals between evaluations; episodes of each, and of the last
-OBSERVER_STEPS = 40_000  # steps from which an observer or, under noise, the weights of the memory z are learned
+EVALUATIONS, EPISODES, LAST_EPISODES = 10, 20, 100  # evaluations after the first; episodes of each, and of the last
+OBSERVER_STEPS = 40_000  # number of steps for learning an observer or, under noise, the weights of z
 TRUTH = 0.15  # initial share of the CPU time, in which agents on x_hat see the true state
 FAULTY = ("noise", "delay", "drop-out")  # kinds in which the observer tracks, and agents on x_hat do not see y
-OF_STATE = ("masked", "parameters")  # agents on the full state train in these only: they see no sensor faults
+OF_STATE = ("masked", "parameters")  # agents on the full state, who see no sensor faults, train in these only
 STEPS = 200_000  # number of steps after which returns are compared, too
 COLUMNS = ("environment", "kind", "shown", "seed", "steps", "seconds", "return")
 
