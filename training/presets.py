@@ -30,7 +30,7 @@ PAPER_SPINN: dict[str, Any] = {
     "collocation": "box", "scaling": "range", "solved_output_layer": False, "transients": False,
 }  # fmt: skip
 NOISE_RANGE = 2.0  # largest measurement noise in training, in multiples of the system's default
-# Bound of |eigenvalue| * dt in discrete time, above FASTEST_MODE: a step may change all of x: old samples matter less.
+# Bound of |eigenvalue| * dt in discrete time, above FASTEST_MODE, as a step may change all of x: the past matters less.
 FASTEST_OF_STEPS = 3.0
 
 
