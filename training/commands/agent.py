@@ -81,12 +81,12 @@ class TaskOptions:
 
     measured: Measured = ()
     """Entries of the flattened observation that agents may see, as in 0,1. In systems, y is measured."""
-    hidden: Annotated[tuple[int, ...], _INDICES, hint("all others, but no constraint force")] = ()
+    hidden: Annotated[tuple[int, ...], _INDICES, hint("all others; without --measured the velocities")] = ()
     """Entries of the flattened observation that an observer estimates."""
     env_kwargs: EnvironmentArguments = ()
     time_constants: Annotated[tuple[float, ...], _STEPS, hint("1,2,4,8")] = ()
-    """Time constants of the memory z and of traces, in actions. Without noise, agents may learn more easily with 1 or
-    1,2."""
+    """Time constants, in actions, of the memory z and of traces (running means). Without noise, agents may
+    learn more easily with 1 or 1,2."""
     frames: Annotated[int | None, hint("8")] = None
     """Number of stacked observations, each with the action before it."""
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -109,9 +109,9 @@ class TaskOptions:
 class Train:
     """Train an agent with stable-baselines3, to hold a system at its target or to act in a partly observed environment.
 
-    Writes agent.safetensors (the policy, with its task and observer) and curve.csv (steps, CPU seconds and return of
-    each episode) into the run's folder. Hyperparameters are those of training/agents/hyperparameters. A resumed
-    training does not reproduce an uninterrupted one.
+    Writes agent.safetensors (the policy, its task, and its observer's name), curve.csv (steps, CPU seconds and return
+    of each episode) and any learned observer into the run's folder. Hyperparameters are those of
+    training/agents/hyperparameters. A resumed training does not reproduce an uninterrupted one.
     """
 
     name: Name
@@ -123,7 +123,7 @@ class Train:
     """Standard deviation of the noise on each measured sample; in environments, the default is 0."""
     timesteps: Annotated[int | None, hint("from the hyperparameters")] = None
     """Number of actions in the training, over all environments."""
-    observer: Annotated[str | None, hint("the system's map; one is learned for environments", metavar="MAP")] = None
+    observer: Annotated[str | None, hint("the system's map; else one is learned for x_hat", metavar="MAP")] = None
     """A shipped map's name or a .safetensors file, for an agent that sees x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
@@ -280,7 +280,7 @@ def evaluate(progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, tru
         x = played.signals("x")
         rows += [
             ("score (mean of exp(-4 cost) - 1, at best 0)", _mean(scores(system, x))),
-            (f"holds the target within {TOLERANCE:g}", f"{_mean(100.0 * successes(system, x))} %"),
+            (f"holds the target within {TOLERANCE:g} scales", f"{_mean(100.0 * successes(system, x))} %"),
             ("escaped", f"{100 * played.escaped.mean():.0f} %"),
         ]
     elif played.x is not None and played.x_hat is not None:

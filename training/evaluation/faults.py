@@ -43,7 +43,7 @@ def simulate_faults(
     x, u, *_ = motions.with_inputs(artifact.nu).drawn(trajectories, rng)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
-    # The bias is a share of the output's range along free motions (random inputs widen it), under a policy along all.
+    # The bias is a share of the output's range: along free motions, as random inputs widen it, or under a policy.
     free = slice(None) if policy else ~u.any((0, 2))
     half, within = len(y) // 2, round(deadline / dt)
     bias = BIAS * np.ptp(clean[half:, free], axis=(0, 1))

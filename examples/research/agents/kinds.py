@@ -282,7 +282,7 @@ def table(rows: "pd.DataFrame", missing: int = 0) -> list[str]:
         "# Kinds of partial observability",
         "",
         "Returns: interquartile means over seeds, [95 % interval], number of seeds. Bold (full state left "
-        f"out): the best mean, and means above the lower end of its interval.{partial}",
+        f"out): the best mean, and means from the lower end of its interval on.{partial}",
         "",
     ]
     equal = agents.apply(lambda curve: np.interp(STEPS, curve.steps, curve["return"]))

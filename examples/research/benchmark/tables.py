@@ -70,7 +70,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
             lines += [f"## NRMSE in % after the first 20 %, {DOMAINS[case[0]]}, noise {case[1]}", ""]
             lines += ["Median of each state's rms error, in % of its standard deviation in all trajectories.", ""]
             lines += _by_method(methods, partial(_each_state, medians, case))
-    order = ", ".join(f"{starts} at noise {noise}" for starts, noise in cases)
+    order = ", ".join(f"{DOMAINS[starts]} at noise {noise}" for starts, noise in cases)
     lines += [
         "## Lost trajectories in %",
         "",
@@ -82,7 +82,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     if len(noise_free):
         component = summarise(noise_free, "component_late").set_index(["system", "method", "starts"])
         rows = _by_method(methods, partial(_beside_printed, component["median"]))
-        text = "Median for starts in X / 1.5X \\ X / 2X \\ X."
+        text = "Mean over components, median over trajectories, for starts in X / 1.5X \\ X / 2X \\ X."
         if any(" (" in cell for row in rows for cell in row.split("|")[2:]):
             text += (
                 " In brackets the figures that the notebooks released with the paper print for 1.5X \\ X, from other "
@@ -92,7 +92,9 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     costs = methods.set_index(["system", "method"])
     lines += ["## Cost", "", "CPU seconds of training; CPU time of a step of one trajectory and of 1,000 at once.", ""]
     lines += _by_method(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "Each method's best on validation runs; with --quick, its first.", ""]
+    compared = "The best configuration on validation runs; only one where a method has no other."
+    chosen = "The first configuration; none were compared." if (methods.budget == "quick").all() else compared
+    lines += ["## Configuration", "", chosen, ""]
     lines += _by_method(methods, partial(_configuration, costs))
     write(path, "\n".join(lines) + "\n")
 
