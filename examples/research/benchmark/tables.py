@@ -83,7 +83,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         component = summarise(noise_free, "component_late").set_index(["system", "method", "starts"])
         rows = _by_method(methods, partial(_beside_printed, component["median"]))
         text = "Mean over components, median over trajectories, for starts in X / 1.5X \\ X / 2X \\ X."
-        if any(" (" in cell for row in rows for cell in row.split("|")[2:]):
+        if any(name in PRINTED.get(system, {}) for system, name in zip(methods.system, methods.method, strict=True)):
             text += (
                 " In brackets the figures that the notebooks released with the paper print for 1.5X \\ X, from other "
                 "networks, budgets and data; docs/results/benchmark.md has more."
